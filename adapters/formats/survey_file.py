@@ -12,6 +12,7 @@ from __future__ import annotations
 import json
 from collections.abc import Iterator
 from dataclasses import replace
+from glob import escape
 from pathlib import Path
 
 import numpy as np
@@ -154,7 +155,7 @@ def _camera(
     """Yield the section of a camera; values of free parameters come from cameras.csv."""
     yield "[[camera]]"
     yield f"name = {_text(camera.name)}"
-    yield f"images = [{', '.join(_text(name.replace('[', '[[]').replace('*', '[*]')) for name in images)}]"
+    yield f"images = [{', '.join(_text(escape(name)) for name in images)}]"
     yield f"size_px = [{camera.size_px[0]}, {camera.size_px[1]}]"
     yield f"pixel_mm = [{camera.pixel_mm[0]!s}, {camera.pixel_mm[1]!s}]"
     if "c" not in weighted:

@@ -15,6 +15,7 @@ from sfm.model.errors import SurveyFileError
 
 MAX_ENTRIES = 500_000  # files and folders that are examined
 BELOW = "**"  # a folder and everything below it
+_BRACKETED = re.compile(r"\[([*?[])\]")  # a wildcard that stands for itself
 COMPANION = "._"  # begins the name of a file of macOS on other disks, which has the name of another after it
 
 
@@ -106,10 +107,19 @@ def parts_of_glob(pattern: str) -> list[str]:
     return parts
 
 
+def name_of_glob(pattern: str) -> str | None:
+    """Return the name that a glob without wildcards stands for, None for a glob with wildcards.
+
+    A wildcard in brackets, as `glob.escape` writes it, stands for itself.
+    """
+    return None if has_magic(_BRACKETED.sub("", pattern)) else _BRACKETED.sub(r"\1", pattern)
+
+
 def _entries(path: Path, part: str, *, hidden: bool) -> Iterator[tuple[Path, bool]]:
     """Yield the entries of a folder, and whether they match a part of a glob."""
-    if part != BELOW and not has_magic(part):
-        child = path / part
+    name = name_of_glob(part)
+    if name is not None:
+        child = path / name
         if child.exists():
             yield child, True
         return

@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import json
 import os
+from glob import escape
 from pathlib import Path
 
 import numpy as np
@@ -14,7 +16,7 @@ from sfm.model.estimate import Estimate
 from sfm.model.network import Network
 from sfm.photographs.exif import Metadata
 from sfm.survey.adjusting.solution_remarks import datum_remarks, missing_control
-from sfm.survey.inputs.cameras import camera_of_image, start_cameras
+from sfm.survey.inputs.cameras import camera_of_images, start_cameras
 from sfm.survey.inputs.measurements import find_photographs
 from sfm.survey.inputs.start import start_values
 from sfm.survey.inputs.survey import read_survey
@@ -496,12 +498,27 @@ def test_a_table_with_byte_order_mark_and_crlf_is_read(tmp_path: Path) -> None:
 def test_images_belong_to_the_camera_whose_glob_they_match(tmp_path: Path) -> None:
     text = MINIMAL.replace("*.jpg", "a*") + '[[camera]]\nname = "two"\nimages = "*b"\n'
     survey = read_survey_file(write(tmp_path, text))
-    assert camera_of_image(survey.cameras, "ac", survey.source) == 0
-    assert camera_of_image(survey.cameras, "cb", survey.source) == 1
+    assert camera_of_images(survey.cameras, ["ac", "cb"], survey.source) == [0, 1]
     with pytest.raises(SurveyFileError, match=r"'ab' matches the glob of 2 cameras: one 'a\*', two '\*b'"):
-        camera_of_image(survey.cameras, "ab", survey.source)
+        camera_of_images(survey.cameras, ["ab"], survey.source)
     with pytest.raises(SurveyFileError, match="'c' matches the glob of no camera"):
-        camera_of_image(survey.cameras, "c", survey.source)
+        camera_of_images(survey.cameras, ["c"], survey.source)
+
+
+def test_names_of_photographs_are_no_globs_however_many(tmp_path: Path) -> None:
+    """Names, escaped or plain, are not searched; the limit is of globs with wildcards."""
+    names = [f"left/{k} [{k % 7}]?.jpg" for k in range(1500)]
+    listed = ", ".join(json.dumps(escape(name)) for name in names)
+    text = MINIMAL.replace('"*.jpg"', f"[{listed}]") + '[[camera]]\nname = "two"\nimages = ["b", "c*"]\n'
+    survey = read_survey(write(tmp_path, text))
+    owners = camera_of_images(survey.cameras, [*names, "b", "cb"], survey.source)
+    assert owners == [0] * len(names) + [1, 1]
+    with pytest.raises(SurveyFileError, match="matches the glob of no camera"):
+        camera_of_images(survey.cameras, ["left/8 1?.jpg"], survey.source)  # no wildcards
+    globs = ", ".join(f'"{k}*"' for k in range(1001))
+    path = write(tmp_path, MINIMAL.replace('"*.jpg"', f"[{globs}]"))
+    with pytest.raises(SurveyFileError, match="1001 globs of photographs with wildcards, at most 1000"):
+        read_survey(path)
 
 
 def test_single_brackets_of_a_camera_are_explained(tmp_path: Path) -> None:

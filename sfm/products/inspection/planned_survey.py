@@ -9,6 +9,7 @@ from __future__ import annotations
 import json
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, replace
+from glob import escape
 from pathlib import Path
 from typing import Annotated, Literal
 
@@ -332,7 +333,7 @@ def write_simulation(
             for parameter, value in values
             if parameter not in free and parameter != "c"
         ]
-        globs = [name.replace("[", "[[]").replace("*", "[*]").replace("?", "[?]") for name in images_of]
+        globs = [escape(name) for name in images_of]
         section = ["[[camera]]", f"name = {json.dumps(camera.name)}", f"images = {json.dumps(globs)}"]
         section += [f"size_px = {list(camera.size_px)}", f"pixel_mm = {camera.pixel_mm.tolist()}"]
         section += [f"c_mm = {camera.c_px * float(np.mean(camera.pixel_mm))!r}", f'model = "{camera.model}"']

@@ -17,14 +17,15 @@ from dataclasses import replace
 
 import numpy as np
 
+from sfm.files.globs import name_of_glob
 from sfm.model.camera import Camera, base_name, camera_from_values
 from sfm.model.conventions import FloatArray, IntArray
-from sfm.model.display import counted
+from sfm.model.display import counted, listed
 from sfm.model.distortion.brown import from_balanced
 from sfm.model.distortion.models import MODELS
 from sfm.model.errors import PhotographError, SurveyFileError
 from sfm.model.estimate import Estimate
-from sfm.model.network import InteriorObservations, Network
+from sfm.model.network import InteriorObservations, Network, rows_of
 from sfm.model.observations.pose import MountObservations
 from sfm.photographs.exif import Metadata
 from sfm.survey.inputs.given_values import StartCameras
@@ -37,41 +38,53 @@ MIN_VIEW_DEG, MAX_VIEW_DEG = (
     170.0,
 )  # diagonal field of view of a central projection; lenses have 1 to 140
 COMMON_VIEW_DEG = 10.0, 120.0  # of nearly all cameras, used to guess a wrong unit
+MAX_SHOWN = 10  # cameras, and globs of a camera, in a message
 MAX_PIXEL_RATIO = 10.0  # of the sides of a pixel; anamorphic lenses and line scanners stay below 3
 
 
-def camera_of_image(cameras: Sequence[CameraSettings], image: str, source: str) -> int:
-    """Return the index of the camera whose glob matches the name of a photograph.
+def camera_of_images(cameras: Sequence[CameraSettings], images: Sequence[str], source: str) -> list[int]:
+    """Return the index of the camera of each photograph, by the globs and names of the cameras.
 
     Args:
         cameras: cameras of the survey.
-        image: name of the photograph.
+        images: names of the photographs.
         source: name of the survey in error messages.
 
     Raises:
-        SurveyFileError: the globs of no camera match, or those of several cameras.
+        SurveyFileError: the globs and names of no camera match, or those of several cameras.
     """
-    matches = cameras_of_image(cameras, image)
-    if len(matches) != 1:
-        globs = ", ".join(f"{c.name} {', '.join(map(repr, c.images or ()))}" for c in cameras)
-        many = "no camera" if not matches else f"{counted(len(matches), 'camera')}"
-        raise SurveyFileError(f"{source}: image '{image}' matches the glob of {many}: {globs}")
-    return matches[0]
+    matches = cameras_of_images(cameras, images)
+    for image, of_image in zip(images, matches, strict=True):
+        if len(of_image) != 1:
+            globs = (f"{c.name} {listed(map(repr, c.images or ()), most=MAX_SHOWN)}" for c in cameras)
+            many = "no camera" if not of_image else f"{counted(len(of_image), 'camera')}"
+            raise SurveyFileError(
+                f"{source}: image '{image}' matches the glob of {many}: {listed(globs, most=MAX_SHOWN)}"
+            )
+    return [of_image[0] for of_image in matches]
 
 
-def cameras_of_image(cameras: Sequence[CameraSettings], image: str) -> list[int]:
-    """Return the indices of the cameras whose globs match the name of a photograph.
+def cameras_of_images(cameras: Sequence[CameraSettings], images: Iterable[str]) -> list[list[int]]:
+    """Return for each photograph the indices of the cameras whose globs or names match its name.
 
     Args:
         cameras: cameras of the survey; a single one without globs has all photographs.
-        image: name of the photograph.
+        images: names of the photographs.
     """
     if len(cameras) == 1 and cameras[0].images is None:
-        return [0]
+        return [[0] for _ in images]
+    by_name: dict[str, list[int]] = {}
+    globs = list[tuple[int, str]]()
+    for index, camera in enumerate(cameras):
+        for pattern in camera.images or ():
+            name = name_of_glob(pattern)
+            if name is None:
+                globs.append((index, pattern))
+            else:
+                by_name.setdefault(name, []).append(index)
     return [
-        index
-        for index, camera in enumerate(cameras)
-        if any(fnmatch.fnmatchcase(image, glob) for glob in camera.images or ())
+        sorted({*by_name.get(image, ()), *(k for k, glob in globs if fnmatch.fnmatchcase(image, glob))})
+        for image in images
     ]
 
 
@@ -100,8 +113,7 @@ def start_cameras(
     """
     index = np.zeros(0, dtype=np.int64) if camera is None else camera
     cameras = []
-    for number, stated in enumerate(settings):
-        photographs = [k for k in range(len(metadata)) if index[k] == number]
+    for stated, photographs in zip(settings, rows_of(index, len(settings)), strict=True):
         size = _common_size(stated, [(names[k], metadata[k].size_px) for k in photographs])
         where = f"{source}: camera {stated.name}"
         if size is None:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import fnmatch
 from collections.abc import Mapping
 from dataclasses import replace
 from datetime import datetime, timedelta
@@ -18,7 +17,6 @@ from sfm.photographs.exif import LocalSystem, SatellitePosition, local_coordinat
 from sfm.survey.inputs.exterior_table import ObservedExterior
 from sfm.survey.inputs.given_values import AXES
 from sfm.survey.inputs.measurements import PhotographList
-from sfm.survey.inputs.settings import CameraSettings
 from sfm.survey.inputs.survey import Survey
 
 # Largest distance of a photograph from the median position: mountains are not seen from farther away.
@@ -98,8 +96,8 @@ def moments_from_exif(survey: Survey, files: PhotographList) -> tuple[Survey, tu
     for rig in survey.rigs:
         if rig.moment != "exif":
             continue
-        cameras = {camera.name: camera for camera in survey.cameras}
-        of_rig = [_times(cameras[name], files, f"{survey.source}: rig {rig.name}") for name in rig.cameras]
+        number = {camera.name: k for k, camera in enumerate(survey.cameras)}
+        of_rig = [_times(number[name], files, f"{survey.source}: rig {rig.name}") for name in rig.cameras]
         corrected, otherwise = dict(of_rig[0]), dict(of_rig[0])
         for camera, times in zip(rig.cameras[1:], of_rig[1:], strict=True):
             ahead, *others = clock_offsets(list(of_rig[0].values()), list(times.values()), rig.tolerance_s)
@@ -144,12 +142,11 @@ def named_moments(times: Mapping[str, datetime], tolerance_s: float) -> dict[str
     return moments
 
 
-def _times(camera: CameraSettings, files: PhotographList, where: str) -> dict[str, datetime]:
+def _times(camera: int, files: PhotographList, where: str) -> dict[str, datetime]:
     """Return the times of the photographs of a camera by its clock, by name."""
     times: dict[str, datetime] = {}
-    for name, path in zip(files.names, files.paths, strict=True):
-        if not any(fnmatch.fnmatchcase(name, glob) for glob in camera.images or ()):
-            continue
+    for k in np.flatnonzero(files.camera == camera):
+        name, path = files.names[k], files.paths[k]
         try:
             taken = read_metadata(path).taken
         except PhotographError:

@@ -23,15 +23,13 @@ from sfm.model.remarks.remark import Remark, remark
 from sfm.photographs.exif import Metadata, read_metadata
 from sfm.photographs.masks import Masks
 from sfm.survey.inputs.cameras import refuse_ungrouped
-from sfm.survey.inputs.settings import CameraSettings
+from sfm.survey.inputs.settings import MAX_PHOTOGRAPHS, CameraSettings
 from sfm.survey.inputs.survey_file import SurveyFile
 from sfm.targets.codes.tags import CORNERS
 from sfm.targets.detect import Targets
 
 if TYPE_CHECKING:
     from sfm.survey.inputs.survey import Survey
-
-MAX_PHOTOGRAPHS = 20_000  # a table with one byte for each pair takes 400 MB
 
 
 @dataclass(frozen=True)

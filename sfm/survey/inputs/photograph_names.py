@@ -25,7 +25,7 @@ from sfm.model.display import listed
 from sfm.model.errors import SurveyFileError
 from sfm.model.remarks.remark import Remark, remark
 from sfm.photographs.exif import read_metadata
-from sfm.survey.inputs.cameras import cameras_of_image
+from sfm.survey.inputs.cameras import cameras_of_images
 from sfm.survey.inputs.exterior_table import ObservedExterior
 from sfm.survey.inputs.given_values import Observations, StartOrientations
 from sfm.survey.inputs.measurements import PhotographList
@@ -115,13 +115,12 @@ def _refuse_no_template(mark: PointSettings, survey: Survey) -> None:
 
 def _of_survey(table: Observations, survey: Survey, files: PhotographList) -> Observations:
     """Return the image points of a table in photographs of the survey."""
-    known = frozenset(files.names)
-
-    @cache
-    def is_of_survey(name: str) -> bool:
-        return name in known or (not table.of_control and bool(cameras_of_image(survey.cameras, name)))
-
-    kept = np.array([is_of_survey(name) for name in table.image])
+    named = set(files.names)
+    if not table.of_control:
+        without_file = [name for name in dict.fromkeys(table.image) if name not in named]
+        cameras = cameras_of_images(survey.cameras, without_file)
+        named |= {name for name, of_name in zip(without_file, cameras, strict=True) if of_name}
+    kept = np.array([name in named for name in table.image])
     if not kept.any():
         names, others = (listed(dict.fromkeys(images), most=1) for images in (table.image, files.names))
         raise SurveyFileError(

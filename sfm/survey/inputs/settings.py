@@ -65,12 +65,13 @@ SMALLEST, LARGEST = 1e-9, 1e12
 MIN_SIGMA = 1e-30  # of a distortion parameter, mm^-8
 MAX_SIDE_PX = 1_000_000
 MAX_CORRELATIONS = 200  # of the parameters of one camera
-MAX_CAMERAS, MAX_GROUPS = 1000, 1000  # each is tried on every photograph
+MAX_PHOTOGRAPHS = 20_000  # a table with one byte for each pair takes 400 MB
+MAX_GROUPS = 1000  # each is tried on every photograph
 MAX_TABLES = 100  # of survey observations
 MAX_RIGS, MAX_PATTERN = 100, 200  # rigs, and characters of the expression that finds a moment
 # Parameters that are adjusted if a survey states none, as far as its photographs determine them.
 FREED_FIRST = ("c", "x0", "y0", "K1", "K2", "fx", "fy", "f", "cx", "cy", "k1", "k2", "k")
-MAX_GLOBS = 1000  # of the photographs of all cameras
+MAX_GLOBS = 1000  # with wildcards, of the photographs of all cameras: each is tried on every photograph
 MAX_LENGTH_PER_SIGMA = 1e6  # no calibration of a scale bar is better than a millionth of its length
 Length = Annotated[float, Field(ge=SMALLEST, le=LARGEST)]
 Probability = Annotated[float, Field(ge=1e-9, le=0.5)]
@@ -89,7 +90,7 @@ TwoCounts = Annotated[tuple[Side, Side], Field(strict=False)]
 Names = Annotated[tuple[Name, ...], Field(strict=False)]
 Globs = Annotated[
     tuple[Name, ...],
-    Field(strict=False, min_length=1, max_length=MAX_GLOBS),
+    Field(strict=False, min_length=1, max_length=MAX_PHOTOGRAPHS),
     BeforeValidator(lambda v: (v,) if isinstance(v, str) else v),
 ]
 Value = Annotated[float, Field(ge=-LARGEST, le=LARGEST)]
@@ -151,7 +152,7 @@ class CameraSettings(Section):
     """[[camera]]: one camera, its photographs and its interior orientation."""
 
     name: Name  # name of the camera; unique in the survey
-    images: Globs | None = None  # globs of its photographs; optional with [observations] and one camera
+    images: Globs | None = None  # globs or names of photographs; optional with [observations], one camera
     size_px: TwoCounts | None = None  # width and height of its photographs, else read from them, px
     pixel_mm: TwoLengths | None = None  # width and height of a pixel, else from sensor_mm or EXIF, mm
     sensor_mm: TwoLengths | None = None  # width and height of the sensor, mm

@@ -19,7 +19,7 @@ from sfm.survey.inputs.calibration import TABLES
 from sfm.survey.inputs.checks.contradictions import refuse_contradictions
 from sfm.survey.inputs.equipment import read_equipment
 from sfm.survey.inputs.settings import (
-    MAX_CAMERAS,
+    MAX_PHOTOGRAPHS,
     MAX_RIGS,
     MAX_TABLES,
     AdjustSettings,
@@ -53,7 +53,8 @@ class SurveyFile(Section):
 
     head: Head = Field(alias="survey")
     cameras: Annotated[
-        tuple[CameraSettings, ...], Field(strict=False, min_length=1, max_length=MAX_CAMERAS, alias="camera")
+        tuple[CameraSettings, ...],
+        Field(strict=False, min_length=1, max_length=MAX_PHOTOGRAPHS, alias="camera"),
     ]
     targets: TargetSettings = TargetSettings()
     plates: Annotated[tuple[PlateSettings, ...], Field(strict=False, alias="plate")] = ()

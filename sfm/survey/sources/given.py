@@ -21,7 +21,7 @@ from sfm.model.errors import SurveyFileError
 from sfm.model.network import ImagePoints, Network, Source, rows_of
 from sfm.model.remarks.remark import Remark, remark
 from sfm.photographs.masks import Masks
-from sfm.survey.inputs.cameras import camera_of_image, refuse_ungrouped, start_cameras
+from sfm.survey.inputs.cameras import camera_of_images, refuse_ungrouped, start_cameras
 from sfm.survey.inputs.checks.copies import same_photographs
 from sfm.survey.inputs.given_values import Observations
 from sfm.survey.inputs.measurements import (
@@ -88,14 +88,11 @@ def read_tables(survey: Survey, tables: tuple[Observations, ...], files: Photogr
     images, image = _numbered([name for table in tables for name in table.image])
     refuse_many(str(tables[0].table.path), images)
     points, point = _numbered([name for table in tables for name in table.point])
-    of_file = dict(zip(files.names, files.camera.tolist(), strict=True))
-    owner = np.array(
-        [
-            of_file[name] if name in of_file else camera_of_image(survey.cameras, name, survey.source)
-            for name in images
-        ],
-        dtype=np.int64,
-    )
+    camera_of = dict(zip(files.names, files.camera.tolist(), strict=True))
+    without_file = [name for name in images if name not in camera_of]
+    others = camera_of_images(survey.cameras, without_file, survey.source)
+    camera_of |= dict(zip(without_file, others, strict=True))
+    owner = np.array([camera_of[name] for name in images], dtype=np.int64)
     refuse_ungrouped(survey.cameras, images, owner, survey.source)
     parts, outside_parts, first = [], [], 0
     for number, table in enumerate(tables):

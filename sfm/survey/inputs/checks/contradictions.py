@@ -4,11 +4,13 @@ from __future__ import annotations
 
 import math
 import re
+from collections import Counter
 from collections.abc import Iterator, Sequence
 from itertools import combinations
 from pathlib import Path
 from typing import Protocol
 
+from sfm.files.globs import name_of_glob
 from sfm.model.display import counted, listed
 from sfm.model.distortion.brown import BALANCED, BALANCED_MODEL, from_balanced
 from sfm.model.distortion.models import MODELS, Role
@@ -133,11 +135,11 @@ def refuse_contradictions(survey: Described) -> None:
 
 
 def _of_cameras(survey: Described) -> Iterator[str]:
-    names = [camera.name for camera in survey.cameras]
-    for name in names:
-        if names.count(name) > 1:
+    names = Counter(camera.name for camera in survey.cameras)
+    for name, times in names.items():
+        if times > 1:
             yield f"two cameras are named '{name}'"
-    needs_images = reads_photographs(survey) or len(names) > 1
+    needs_images = reads_photographs(survey) or len(survey.cameras) > 1
     for camera in survey.cameras:
         for of_settings in (
             _of_balanced, _of_parameters, _of_surface, _of_correlations, _of_calibration, _of_values
@@ -304,9 +306,10 @@ def _of_pattern(pattern: str) -> Iterator[str]:
 
 
 def _of_photographs(survey: Described) -> Iterator[str]:
-    globs = sum(len(camera.images or ()) for camera in survey.cameras)
+    patterns = (pattern for camera in survey.cameras for pattern in camera.images or ())
+    globs = sum(name_of_glob(pattern) is None for pattern in patterns)
     if globs > MAX_GLOBS:
-        yield f"{globs} globs of photographs, at most {MAX_GLOBS} are searched"
+        yield f"{globs} globs of photographs with wildcards, at most {MAX_GLOBS} are searched"
     if survey.compare.baseline != "none" and not reads_photographs(survey):
         yield (
             f"compare.baseline = '{survey.compare.baseline}' needs photographs, the survey has "
