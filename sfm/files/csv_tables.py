@@ -19,7 +19,7 @@ from typing import TextIO
 
 import numpy as np
 
-from sfm.files.plain_text import MAX_NAME, as_plain, from_cell, is_plain
+from sfm.files.plain_text import MAX_NAME, as_plain, from_cell, is_plain, is_word
 from sfm.model.conventions import BoolArray, FloatArray, IntArray
 from sfm.model.display import counted
 from sfm.model.errors import OutputError, SurveyFileError
@@ -366,7 +366,10 @@ def _opened(path: Path) -> TextIO:
 
 def _name(cell: str, where: str) -> str:
     """Return a name; refuse empty or very long names and invisible characters."""
-    name = from_cell(cell.strip())
+    name = cell.strip()
+    if is_word(name) and len(name) <= MAX_NAME:
+        return sys.intern(name)
+    name = from_cell(name)
     if not name:
         raise SurveyFileError(f"{where} is empty, a name is needed")
     if len(name) > MAX_NAME or not is_plain(name):

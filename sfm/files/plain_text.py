@@ -109,6 +109,11 @@ def csv_blocks(header: Sequence[str], rows: Iterable[Sequence[object]]) -> Itera
         yield "\n".join(map(",".join, zip(*columns, strict=True))) + "\n"
 
 
+def is_word(text: str) -> bool:
+    """Return whether a text has ASCII letters and digits only, so that it is its own cell."""
+    return text.isascii() and text.isalnum()
+
+
 def as_cell(text: str) -> str:
     """Return a text with an apostrophe before every part that a spreadsheet would take as a formula."""
     return _BARE.sub(r"\1'\2", text)
@@ -145,9 +150,15 @@ def as_plain(text: str) -> str:
 
 def _column(values: Sequence[object]) -> list[str]:
     """Return the cells of a column."""
-    if all(type(value) is float for value in values):
+    kinds = set(map(type, values))
+    if kinds == {float}:
         numbers = cast(Sequence[float], values)
+        if all(map(math.isfinite, numbers)):
+            return list(map(repr, numbers))
         return [repr(value) if value - value == 0 else "" for value in numbers]  # neither NaN nor infinite
+    if kinds == {str}:
+        texts = cast(Sequence[str], values)
+        return [text if is_word(text) else _text_cell(text) for text in texts]
     return [_cell(value) for value in values]
 
 

@@ -136,8 +136,7 @@ def survey_of_model(
     """
     network, estimate = model.network, model.estimate
     seen = network.image_points
-    used = estimate.oriented[seen.image] & estimate.determined[seen.point]
-    seen = seen.select(used)
+    seen = seen.select(estimate.oriented[seen.image] & estimate.determined[seen.point])
     oriented, determined = np.unique(seen.image), np.unique(seen.point)  # those that have image points
     free = free_cameras(network, estimate, fixed)
     photographs = [

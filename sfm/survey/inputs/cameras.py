@@ -113,7 +113,7 @@ def start_cameras(
     """
     index = np.zeros(0, dtype=np.int64) if camera is None else camera
     cameras = []
-    for stated, photographs in zip(settings, rows_of(index, len(settings)), strict=True):
+    for stated, photographs in zip(settings, rows_of(index[: len(metadata)], len(settings)), strict=True):
         size = _common_size(stated, [(names[k], metadata[k].size_px) for k in photographs])
         where = f"{source}: camera {stated.name}"
         if size is None:

@@ -63,8 +63,10 @@ def measure_given(survey: Survey, files: PhotographList = NO_PHOTOGRAPHS, **_: o
 def read_tables(survey: Survey, tables: tuple[Observations, ...], files: PhotographList) -> Measurements:
     """Return the network of tables of image points.
 
-    Photographs and points are numbered in the order in which the tables first name them. The control is
-    part of the network in every datum. The adjustment uses it only if the datum is `control`.
+    Photographs and points are numbered in the order in which the tables first name them; photographs that
+    all have start orientations in the order of these, since what moved during a survey is sought in the order
+    of its photographs. The control is part of the network in every datum. The adjustment uses it only if the
+    datum is `control`.
 
     Args:
         survey: gives cameras, and masks.
@@ -85,7 +87,9 @@ def read_tables(survey: Survey, tables: tuple[Observations, ...], files: Photogr
         tuple(files.names[k] for k in readable),
         survey.start_cameras,
     )
-    images, image = _numbered([name for table in tables for name in table.image])
+    names = [name for table in tables for name in table.image]
+    started = () if survey.start_orientations is None else survey.start_orientations.names
+    images, image = _numbered(names, order=started)
     refuse_many(str(tables[0].table.path), images)
     points, point = _numbered([name for table in tables for name in table.point])
     camera_of = dict(zip(files.names, files.camera.tolist(), strict=True))
@@ -180,9 +184,12 @@ def _merge_tables(
     )
 
 
-def _numbered(names: Sequence[str]) -> tuple[tuple[str, ...], IntArray]:
-    """Return the unique names in order of first appearance, and the index of each entry."""
+def _numbered(names: Sequence[str], *, order: Sequence[str] = ()) -> tuple[tuple[str, ...], IntArray]:
+    """Return the unique names and the index of each entry; in order of `order`, if all of them are in it."""
+    known = set(names)
     number: dict[str, int] = {}
+    if known <= set(order):
+        number = {name: k for k, name in enumerate(name for name in order if name in known)}
     index = np.array([number.setdefault(name, len(number)) for name in names], dtype=np.int64)
     return tuple(number), index
 

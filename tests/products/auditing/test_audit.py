@@ -140,6 +140,15 @@ def test_cameras_are_told_by_their_photographs_whatever_their_names() -> None:
     ]
 
 
+def test_photographs_keep_their_order_where_image_points_are_listed_by_point() -> None:
+    """Points that moved are sought in the order of the photographs, of which the first may see few points."""
+    network, truth = network_of("by point")
+    seen = network.image_points
+    late = seen.select(np.lexsort((-seen.image, seen.point)))
+    a = audited(model_of(replace(network, image_points=late), truth)).result.adjustment
+    assert a.network.images == network.images
+
+
 def test_rigs_that_are_not_kept_are_said() -> None:
     network, truth = network_of("rigged", cameras=2)
     audit = audited(model_of(network, truth))
