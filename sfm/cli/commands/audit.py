@@ -79,9 +79,9 @@ def audit(
         stated_model = replace(content.result, name=model.resolve().name)  # of "." too
         stated = stated_of(stated_model)
         given = None if survey is None else read_survey(survey)
-        audited = survey_of_model(stated_model, stated, fixed=names_in(fix), given=given)
+        audited, unused = survey_of_model(stated_model, stated, fixed=names_in(fix), given=given)
     left = [f"{count} {kind.words}" for kind, count in losses(content, ALL.difference(NOT_USED))]
-    notes = (*content.notes, *([f"not used of the model: {listed(left)}"] if left else []))
+    notes = (*content.notes, *([f"not used of the model: {listed(left)}"] if left else []), *unused)
     folder = out or Path("out") / f"{folder_name(stated_model.name)}_audit"
     refuse_foreign_folder(folder)
     origin = Origin(model, model.parent)

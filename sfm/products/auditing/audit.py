@@ -1,15 +1,14 @@
 """A model of another program, adjusted anew from its own image points, beside the figures it came with.
 
-The model gives image points and start values; a survey may add control, scale bars and survey observations.
-Everything else is that of any survey of image points: gross errors, datum, covariance, judgement. What the
-model states of itself is how it projects its own points.
+The model gives image points, start values and rigs; a survey may add cameras, rigs, control, scale bars and
+survey observations. Everything else is that of any survey of image points: gross errors, datum, covariance,
+judgement. What the model states of itself is how it projects its own points.
 
 Source: Foerstner and Wrobel (2016), Photogrammetric Computer Vision, sec. 4.5 and 15.4 (gauge of a block).
 """
 
 from __future__ import annotations
 
-import glob
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
@@ -19,18 +18,21 @@ from sfm.adjustment.covariance import change_datum
 from sfm.adjustment.datum import Datum
 from sfm.judgement.checks import root_mean_square
 from sfm.judgement.survey_result import SurveyResult
-from sfm.model.camera import Camera, pixel_from_rays
+from sfm.model.camera import pixel_from_rays
 from sfm.model.conventions import MAD_TO_SIGMA, METRES, FloatArray, angles_from_rotation
+from sfm.model.display import listed
 from sfm.model.errors import GeometryError
 from sfm.model.network import rows_of
 from sfm.model.similarity import fit_similarity
 from sfm.model.solution import Solution
+from sfm.products.auditing.carried import carried_of
 from sfm.products.refining.refinement import free_cameras
 from sfm.survey.inputs.given_values import KnownPoints, Observations, ScaleBar, StartOrientations
-from sfm.survey.inputs.survey import CameraSetup, Survey
+from sfm.survey.inputs.survey import Survey
 
 LEAST_SIGMA_PX = 1e-3  # of image points that a model fits without residuals, as those of a simulation
 MIN_FIXED = 3  # points that a datum needs
+MAX_NAMED = 20  # parts in a note on what is not used
 DATUM = 7  # coordinates, angles and scale that image points do not tell
 
 
@@ -118,17 +120,21 @@ def stated_of(model: Solution) -> Stated:
 
 def survey_of_model(
     model: Solution, stated: Stated, *, fixed: tuple[str, ...] = (), given: Survey | None = None
-) -> Survey:
+) -> tuple[Survey, tuple[str, ...]]:
     """Return the survey of a model's image points, with its cameras, photographs and points as start values.
 
-    The standard deviation of the image points is that of the model's residuals, unless they or the given
-    survey state their own.
+    The rigs of the model are kept. The standard deviation of the image points is that of the model's
+    residuals, unless they or the given survey state their own.
 
     Args:
         model: the model.
         stated: what it states of itself.
         fixed: names of interior parameters to hold, such as cx or k1.
-        given: survey whose control, scale bars, tables, unit and settings of the adjustment are used.
+        given: survey whose cameras, rigs, control, scale bars, tables, observed orientations, unit and
+            settings of the adjustment are used.
+
+    Returns:
+        The survey, and what of the model and of the given survey is not used, a line for each.
 
     Raises:
         GeometryError: no camera has a parameter of a name to hold.
@@ -139,18 +145,15 @@ def survey_of_model(
     seen = seen.select(estimate.oriented[seen.image] & estimate.determined[seen.point])
     oriented, determined = np.unique(seen.image), np.unique(seen.point)  # those that have image points
     free = free_cameras(network, estimate, fixed)
-    photographs = [
-        [network.images[i] for i in oriented[network.camera[oriented] == k]] for k in range(len(free))
-    ]
-    cameras = [
-        _setup(camera, images, alone=sum(map(bool, photographs)) == 1)
-        for camera, images in zip(free, photographs, strict=True)
-        if images
-    ]
+    carried = carried_of(model, oriented, free, fixed, given)
     sigma = seen.stated_sigma
     survey = Survey(
         name=model.name,
-        cameras=tuple(cameras),
+        cameras=tuple(carried.cameras),
+        rigs=tuple(carried.rigs),
+        mounts=tuple(carried.mounts),
+        moments=carried.moments,
+        exterior=carried.exterior,
         unit=model.unit if model.unit in METRES else "m",  # without control or bars it stays unknown
         adjust={"sigma_px": stated.sigma_px, "reject": "tau"},  # type: ignore[arg-type]
         compare={"backend": "none"},  # type: ignore[arg-type]
@@ -171,14 +174,16 @@ def survey_of_model(
             [network.points[j] for j in determined], estimate.points[determined]
         ),
     )
+    unused = (("the model", carried.of_model), ("the survey file", carried.of_survey))
+    notes = tuple(f"not used of {whose}: {listed(parts, most=MAX_NAMED)}" for whose, parts in unused if parts)
     if given is None:
-        return survey
+        return survey, notes
     own = {
         name: value
         for name, value in (("sigma_px", stated.sigma_px), ("reject", "tau"))
         if name not in given.adjust.model_fields_set
     }
-    return replace(
+    survey = replace(
         survey,
         unit=given.unit,
         control=given.control or survey.control,
@@ -188,24 +193,7 @@ def survey_of_model(
         datum=given.datum,
         adjust=given.adjust.model_copy(update=own),
     )
-
-
-def _setup(camera: Camera, images: Sequence[str], *, alone: bool) -> CameraSetup:
-    """Return the settings of a camera of a model; its only camera takes all photographs."""
-    values = dict(zip(camera.names, camera.parameters.tolist(), strict=True))
-    is_free = dict(zip(camera.names, camera.free.tolist(), strict=True))
-    c_mm = values.pop("c", None)
-    return CameraSetup(
-        name=camera.name,
-        images=None if alone else tuple(glob.escape(image) for image in images),
-        size_px=camera.size_px,
-        pixel_mm=tuple(camera.pixel_mm.tolist()),
-        c_mm=c_mm,
-        model=camera.model,
-        free=tuple(name for name in camera.names if is_free[name]),
-        fixed={name: value for name, value in values.items() if not is_free[name]},
-        start={name: value for name, value in values.items() if is_free[name]},
-    )
+    return survey, notes
 
 
 def _control(model: Solution) -> KnownPoints | None:

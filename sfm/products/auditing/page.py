@@ -9,8 +9,10 @@ import numpy as np
 
 from sfm.judgement.bundle_statistics import given_of
 from sfm.judgement.checks import root_mean_square, standard_deviations
+from sfm.model.camera import Camera
 from sfm.model.conventions import FloatArray
 from sfm.model.display import counted, listed
+from sfm.model.network import rows_of
 from sfm.model.remarks.verdict import Level
 from sfm.products.auditing.audit import Audit
 from sfm.report.given_residuals import given_parts
@@ -97,8 +99,6 @@ def _figures(audit: Audit, unit: str) -> Iterator[Part]:
         )
     for words in audit.notes:
         yield Paragraph(f"{words[:1].upper()}{words[1:]}.")
-    if model.network.moment is not None:
-        yield Note("The rigs of the model are not kept: its photographs are adjusted one by one.")
     share = a.redundancy / (2 * len(v))
     yield Note(
         "The model's residuals are those of its own cameras, photographs and points. The mean length of a "
@@ -111,14 +111,15 @@ def _figures(audit: Audit, unit: str) -> Iterator[Part]:
 def _cameras(audit: Audit) -> Iterator[Part]:
     """Yield the interior orientation before and after, with its standard deviations and correlations."""
     a = audit.result.adjustment
-    theirs = {camera.name: camera for camera in audit.model.estimate.cameras}
+    theirs = _cameras_of_model(audit)
     rows, held = [], dict[str, int]()
     for k, camera in enumerate(a.estimate.cameras):
-        before = theirs[camera.name]
+        before = theirs[k]
         sigma = a.interior_sigma(k)
         partners = _strongest(a.covariance.interior[k], camera.free, camera.names)
         for p, (name, unit) in enumerate(zip(camera.names, camera.units, strict=True)):
-            value, start = float(camera.parameters[p]), float(before.parameters[p])
+            value = float(camera.parameters[p])
+            start = np.nan if before is None else float(before.parameters[p])
             if not camera.free[p]:
                 held[name] = held.get(name, 0) + bool(value or camera.parts[1][p])
                 continue
@@ -137,7 +138,7 @@ def _cameras(audit: Audit) -> Iterator[Part]:
     heads = (
         Column("camera", "camera"),
         Column("parameter", "parameter"),
-        Column("the model", "stated", format=".8g"),
+        Column("the model", "stated", format=".8g", unknown=""),
         Column("adjusted", "adjusted", format=".8g"),
         Column("sigma", "sigma", format=significant),
         Column("change / sigma", "change_over_sigma", format="z.1f", unknown=""),
@@ -158,6 +159,22 @@ def _cameras(audit: Audit) -> Iterator[Part]:
     if strong:
         words = "; ".join(f"{of.parameter} with {', '.join(of.partners)}" for of in strong)
         yield Paragraph(f"Correlated with the orientation of photographs: {words}.")
+
+
+def _cameras_of_model(audit: Audit) -> list[Camera | None]:
+    """Return the model's camera for each adjusted camera; None if it has several or another lens model."""
+    a, model = audit.result.adjustment, audit.model
+    number = {name: i for i, name in enumerate(model.network.images)}
+    of_photograph = model.network.camera[[number[name] for name in a.network.images]]
+    cameras: list[Camera | None] = []
+    for camera, rows in zip(
+        a.estimate.cameras, rows_of(a.network.camera, len(a.estimate.cameras)), strict=True
+    ):
+        of_model = [model.estimate.cameras[k] for k in np.unique(of_photograph[rows])]
+        same = len(of_model) == 1 and of_model[0].model == camera.model
+        same = same and np.allclose(of_model[0].pixel_mm, camera.pixel_mm)
+        cameras.append(of_model[0] if same else None)
+    return cameras
 
 
 def _strongest(covariance: FloatArray, free: np.ndarray, names: tuple[str, ...]) -> dict[str, str]:

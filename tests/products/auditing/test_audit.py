@@ -19,12 +19,14 @@ from sfm.model.solution import Solution
 from sfm.pipeline import run_survey
 from sfm.products.auditing.audit import Audit, audit_of, stated_of, survey_of_model
 from sfm.report.pages import html_of, page_of
+from sfm.survey.inputs.exterior_table import ObservedExterior
 from sfm.survey.inputs.given_values import ScaleBar
-from sfm.survey.inputs.settings import AdjustSettings
+from sfm.survey.inputs.settings import AdjustSettings, RigSettings
 from sfm.survey.inputs.survey import CameraSetup, Survey
 from tests import commands
 from tests.products.calibration.boards import SIGMA_PX
 from tests.products.calibration.fisheyes import fisheye_board
+from tests.rigs import make_rig
 from tests.synthetic import make_network, seed_of
 
 NOISE_PX = 0.3
@@ -43,7 +45,7 @@ def model_of(network: Network, truth: Estimate, *, off: float = 0.0) -> Solution
 
 def audited(model: Solution, **how: object) -> Audit:
     stated = stated_of(model)
-    return audit_of(model, stated, run_survey(survey_of_model(model, stated, **how)))  # type: ignore[arg-type]
+    return audit_of(model, stated, run_survey(survey_of_model(model, stated, **how)[0]))  # type: ignore[arg-type]
 
 
 def test_a_model_is_adjusted_to_what_its_image_points_tell() -> None:
@@ -96,9 +98,9 @@ def test_a_survey_gives_scale_to_a_model() -> None:
     placing = fit_similarity(a.estimate.points, truth.points)
     assert placing.scale == pytest.approx(1.0, abs=1e-3)
     stated = stated_of(model)
-    assert survey_of_model(model, stated, given=given).adjust.sigma_px == stated.sigma_px
+    assert survey_of_model(model, stated, given=given)[0].adjust.sigma_px == stated.sigma_px
     own = replace(given, adjust=AdjustSettings(sigma_px=0.2, reject="none"))
-    adjust = survey_of_model(model, stated, given=own).adjust
+    adjust = survey_of_model(model, stated, given=own)[0].adjust
     assert (adjust.sigma_px, adjust.reject) == (0.2, "none")
 
 
@@ -149,13 +151,89 @@ def test_photographs_keep_their_order_where_image_points_are_listed_by_point() -
     assert a.network.images == network.images
 
 
-def test_rigs_that_are_not_kept_are_said() -> None:
-    network, truth = network_of("rigged", cameras=2)
-    audit = audited(model_of(network, truth))
-    assert "rigs of the model" not in html_of(audit, report="report.html")
-    moment = np.arange(len(network.images)) // 2
-    rigged = replace(audit.model, network=replace(network, moment=moment))
-    assert "rigs of the model are not kept" in html_of(replace(audit, model=rigged), report="report.html")
+def test_rigs_of_a_model_are_kept() -> None:
+    """The mount is adjusted from all moments."""
+    network, truth = make_rig(seed_of("kept rig"), moments=6, points=60, noise_px=NOISE_PX)
+    model = model_of(network, truth)
+    survey, notes = survey_of_model(model, stated_of(model))
+    assert not notes and [rig.cameras for rig in survey.rigs] == [("camera 1", "camera 2")]
+    audit = audited(model, fixed=("c", "x0", "y0"))
+    a, true = audit.result.adjustment, truth.mounts
+    mounts = a.estimate.mounts
+    assert mounts is not None and true is not None and audit.result.verdict.level == "good"
+    assert a.unknown_counts[0] == 6 * 6 + 6  # poses of six moments and one mount
+    scale = fit_similarity(a.estimate.points, truth.points).scale
+    np.testing.assert_allclose(scale * mounts.position[1], true.position[1], atol=2e-3)
+
+
+def test_mounts_that_a_model_holds_stay_held() -> None:
+    network, truth = make_rig(seed_of("held mounts"), moments=5, points=60)
+    true = truth.mounts
+    assert true is not None
+    held = replace(true, free=np.zeros_like(true.free))
+    model = replace(model_of(network, replace(truth, mounts=held)), unit="m")
+    mounts = audited(model).result.adjustment.estimate.mounts
+    assert mounts is not None and not mounts.free.any()
+    np.testing.assert_allclose(mounts.position, true.position, atol=1e-12)
+    np.testing.assert_allclose(mounts.rotation, true.rotation, atol=1e-12)
+
+
+def test_rigs_of_a_survey_file_join_photographs_of_a_model() -> None:
+    network, truth = make_rig(seed_of("given rig"), moments=6, points=60, noise_px=NOISE_PX)
+    model = model_of(replace(network, moment=None), replace(truth, mounts=None))
+    cameras = [CameraSetup(name=f"eye {k}", images=f"*camera {k}", c_mm=8.0) for k in (1, 2)]
+    rig = RigSettings(name="pair", cameras=("eye 1", "eye 2"), moment="moment ([0-9]+)")
+    given = Survey(name="rig", unit="m", cameras=cameras, rigs=(rig,))
+    survey, notes = survey_of_model(model, stated_of(model), given=given)
+    assert not notes and [camera.name for camera in survey.cameras] == ["eye 1", "eye 2"]
+    assert audited(model, given=given).result.adjustment.unknown_counts[0] == 6 * 6 + 6
+    timed = rig.model_copy(update={"moment": "exif"})
+    _, notes = survey_of_model(model, stated_of(model), given=replace(given, rigs=(timed,)))
+    assert notes == ("not used of the survey file: rig pair (its moments are in EXIF data of photographs)",)
+
+
+def test_a_camera_that_a_survey_file_states_takes_the_place_of_the_models() -> None:
+    """A calibrated camera in another lens model is held, and shown beside no value of the model."""
+    network, truth = network_of("calibrated", cameras=2)
+    model = model_of(network, truth)
+    first = [network.images[i] for i in np.flatnonzero(network.camera == 0)]
+    f, size = 1600.0, truth.cameras[0].size_px
+    stated = CameraSetup(name="D3", images=first, pixel_mm=(0.005, 0.005), c_mm=f * 0.005, free=[])
+    audit = audited(model, given=Survey(name="given", unit="m", cameras=(stated,)))
+    other, camera = audit.result.adjustment.estimate.cameras
+    assert (camera.name, camera.model, camera.size_px) == ("D3", "brown", size)
+    assert camera.value("c") == f * 0.005 and not camera.free.any()
+    assert other.name == truth.cameras[1].name and other.free.any()
+    text = page_of(audit, report="report.html").text
+    assert "D3" not in text.split("Held at")[0] and other.name in text
+    own = CameraSetup(name="D3", images=first, free=["fx"], model="opencv")
+    survey, _ = survey_of_model(model, stated_of(model), given=Survey(name="g", unit="m", cameras=(own,)))
+    assert survey.cameras[-1].start == (("fx", truth.cameras[0].value("fx")),)
+
+
+def test_what_of_a_survey_file_is_not_used_is_said() -> None:
+    network, truth = network_of("not used", cameras=2)
+    model = model_of(network, truth)
+    cameras = (
+        CameraSetup(name="all", images=list(network.images), c_mm=8.0),
+        CameraSetup(name="none", images="*.tif", c_mm=8.0),
+    )
+    exterior = ObservedExterior.from_arrays([network.images[2], "lost"], truth.position[[2, 3]], 1e-3)
+    given = Survey(
+        name="given",
+        unit="m",
+        cameras=cameras,
+        rigs=(RigSettings(name="pair", cameras=("all", "none"), moment="order"),),
+        targets={"codes": "ring14"},
+        exterior=exterior,
+    )
+    survey, notes = survey_of_model(model, stated_of(model), given=given)
+    assert survey.exterior is not None and survey.exterior.names == (network.images[2],)
+    assert notes == (
+        "not used of the survey file: camera all (its photographs are of 2 cameras of the model), camera "
+        "none (no photograph of the model is its own), rig pair (no photographs of camera all, none alone), "
+        "1 row of [exterior] (no photograph of the model), [targets]",
+    )
 
 
 def test_image_points_that_the_camera_of_a_model_does_not_see_are_counted() -> None:
@@ -185,7 +263,7 @@ def test_correlated_control_of_a_model_is_kept() -> None:
     C = np.array([[4.0, 1.0, -0.5], [1.0, 3.0, 0.2], [-0.5, 0.2, 5.0]]) * 1e-6
     control = ObjectPoints(np.arange(4), truth.points[:4], np.tile(C, (4, 1, 1)))
     model = model_of(network.with_given(control), truth)
-    survey = survey_of_model(model, stated_of(model))
+    survey, _ = survey_of_model(model, stated_of(model))
     assert survey.control is not None
     np.testing.assert_allclose(survey.control.covariance, control.covariance, rtol=1e-12)
 
