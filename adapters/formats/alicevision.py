@@ -34,6 +34,7 @@ from adapters.formats.stated_model import (
     content_of,
     from_vision_axes,
     numbers_of_slots,
+    rigs_of,
     to_vision_axes,
 )
 from adapters.reading.trees import Tree, read_tree
@@ -41,7 +42,8 @@ from sfm.files.plain_text import MAX_PIXEL_MM, shorten
 from sfm.files.whole_files import whole_file
 from sfm.model.camera import Camera, camera_from_values
 from sfm.model.conventions import FloatArray
-from sfm.model.network import rows_of
+from sfm.model.estimate import Estimate
+from sfm.model.network import Network, rows_of
 
 WHAT = "a scene of AliceVision"
 # versions since which principal points, focal lengths and ratios are as described
@@ -78,7 +80,11 @@ def read_alicevision(path: Path) -> Content:
     poses = {
         pose.text("poseId"): _pose(pose.below("pose").below("transform")) for pose in tree.items("poses")
     }
-    rigs = {rig.text("rigId"): rig.items("subPoses") for rig in tree.items("rigs")}
+    for rig in tree.items("rigs"):
+        for k, sub in enumerate(rig.items("subPoses")):
+            place = sub.below("pose")
+            R, centre = _pose(place.below("transform") if place.key("transform") else place)
+            stated.places[f"{rig.text('rigId')} {k}"] = (R, -R @ centre)
     images: dict[str, int] = {}
     for view in tree.items("views"):
         of = view.text("intrinsicId")
@@ -87,7 +93,10 @@ def read_alicevision(path: Path) -> Content:
         pose = poses.get(view.text("poseId", view.text("viewId")))
         own = view.key("isPoseIndependant") is None or view.truth("isPoseIndependant")
         if pose is not None and view.key("rigId") and not own:
-            pose = _of_rig(view, pose, rigs)
+            at = _place(view, stated)
+            stated.on_rig[len(stated.images)] = (at, view.text("poseId", view.text("viewId")))
+            (R, t), (R_rig, centre_rig) = stated.places[at], pose
+            pose = R @ R_rig, centre_rig - R_rig.T @ R.T @ t
         images[view.text("viewId")] = len(images)
         name = view.text("path", f"{view.text('viewId')}.jpg")
         if pose is None:
@@ -117,7 +126,10 @@ def write_alicevision(path: Path, content: Content) -> None:
     """
     result = select_placed(content).result
     network, estimate = result.network, result.estimate
-    R = to_vision_axes(estimate.rotation)
+    rotation = to_vision_axes(estimate.rotation)
+    poses: dict[str, tuple[FloatArray, FloatArray]] = {}  # R and centre by poseId
+    rigs, of_rig = _rigs(network, estimate, poses)
+    poses |= {f"{i}": (rotation[i], estimate.position[i]) for i in range(len(rotation)) if i not in of_rig}
     size = [estimate.cameras[a].size_px for a in network.camera.tolist()]
     seen = network.image_points
     slot, image, xy = numbers_of_slots(seen.image).tolist(), seen.image.tolist(), seen.xy.tolist()
@@ -134,19 +146,18 @@ def write_alicevision(path: Path, content: Content) -> None:
                 "height": f"{size[i][1]}",
                 "metadata": "",
             }
+            | of_rig.get(i, {})
             for i, name in enumerate(network.images)
         ],
         "intrinsics": [_intrinsic(a, camera) for a, camera in enumerate(estimate.cameras)],
         "poses": [
             {
-                "poseId": f"{i}",
-                "pose": {
-                    "transform": {"rotation": _texts(R[i].T), "center": _texts(estimate.position[i])},
-                    "locked": "0",
-                },
+                "poseId": number,
+                "pose": {"transform": _transform(R, centre), "locked": "0"},
             }
-            for i in range(len(network.images))
+            for number, (R, centre) in poses.items()
         ],
+        **({"rigs": rigs} if rigs else {}),
         "structure": [
             {
                 "landmarkId": f"{j}",
@@ -168,6 +179,37 @@ def write_alicevision(path: Path, content: Content) -> None:
     }
     with whole_file(path) as part:
         part.write_text(json.dumps(scene, indent=1, ensure_ascii=False) + "\n", encoding="utf-8")
+
+
+def _rigs(
+    network: Network, estimate: Estimate, poses: dict[str, tuple[FloatArray, FloatArray]]
+) -> tuple[list[dict[str, Any]], dict[int, dict[str, str]]]:
+    """Return the rigs, and the keys of their views by photograph; poses get R and centre of their moments."""
+    places, frames = rigs_of(network, estimate)
+    rigs, sub_pose = list[dict[str, Any]](), dict[int, tuple[str, str]]()
+    for number, cameras in enumerate(estimate.mounts.by_rig().values() if estimate.mounts else ()):
+        on = [a for a in cameras if a in places]
+        sub_pose |= {a: (f"{number}", f"{k}") for k, a in enumerate(on)}
+        transforms = [_transform(R, -R.T @ t) for R, t in (places[a] for a in on)]
+        rigs.append(
+            {
+                "rigId": f"{number}",
+                "subPoses": [{"status": "estimated", "pose": transform} for transform in transforms],
+            }
+        )
+    views: dict[int, dict[str, str]] = {}
+    for frame in frames.values():
+        R, t = frame.pose
+        first = f"{frame.photographs[0]}"  # the poses of other photographs are not used
+        poses[first] = (R, -R.T @ t)
+        for i in frame.photographs:
+            rig, sub = sub_pose[int(network.camera[i])]
+            views[i] = {"poseId": first, "rigId": rig, "subPoseId": sub, "isPoseIndependant": "false"}
+    return rigs if views else [], views
+
+
+def _transform(R: FloatArray, centre: FloatArray) -> dict[str, list[str]]:
+    return {"rotation": _texts(R.T), "center": _texts(centre)}
 
 
 def _camera(name: str, tree: Tree, version: tuple[int, ...]) -> Camera:
@@ -243,20 +285,15 @@ def _pose(tree: Tree) -> tuple[FloatArray, FloatArray]:
     return tree.numbers(("rotation",), 9).reshape(3, 3).T, tree.numbers(("center",), 3)
 
 
-def _of_rig(
-    view: Tree, pose: tuple[FloatArray, FloatArray], rigs: dict[str, list[Tree]]
-) -> tuple[FloatArray, FloatArray]:
-    """Return the pose of a view whose rig has a pose."""
-    sub = rigs.get(view.text("rigId"), [])
+def _place(view: Tree, stated: StatedModel) -> str:
+    """Return the place on its rig of a view whose rig has a pose."""
     number = _number(view, "subPoseId")
-    if number >= len(sub):
+    place = f"{view.text('rigId')} {number}"
+    if place not in stated.places:
         raise view.error(
             f"{view.place}subPoseId is {number}, which is not in rig {shorten(view.text('rigId'))}"
         )
-    place = sub[number].below("pose")
-    R, centre = _pose(place.below("transform") if place.key("transform") else place)
-    R_rig, centre_rig = pose
-    return R @ R_rig, centre_rig + R_rig.T @ centre
+    return place
 
 
 def _number(tree: Tree, name: str) -> int:

@@ -234,11 +234,29 @@ def _rigs(content: Content) -> FloatArray:
     if estimate.mounts is None or content.result.network.moment is None:
         return np.zeros((0, 20))
     mounts = estimate.mounts
-    rigs = [float(crc32(name.encode())) for name in mounts.rig]
+    rigs = [mounts.rig.index(name) for name in mounts.rig]  # the first camera of each
     on = [a for a, name in enumerate(mounts.rig) if name]
     R = mounts.rotation.reshape(-1, 9)
-    rows = np.column_stack([np.arange(len(rigs)), rigs, mounts.position, R, mounts.free])
-    return np.asarray(rows[on])
+    return np.asarray(np.column_stack([np.arange(len(rigs)), rigs, mounts.position, R])[on])
+
+
+@_kind("rig names", "names of rigs")
+def _rig_names(content: Content) -> FloatArray:
+    mounts = content.result.estimate.mounts
+    kept = () if mounts is None or content.result.network.moment is None else mounts.by_rig()
+    return _names(tuple(kept), True)
+
+
+@_kind("held mounts", "mounts that are held")
+def _held_mounts(content: Content) -> FloatArray:
+    mounts = content.result.estimate.mounts
+    if mounts is None or content.result.network.moment is None:
+        return np.zeros((0, 7))
+    at_reference = [of_rig[0] for of_rig in mounts.by_rig().values()]
+    held = [
+        a for a, rig in enumerate(mounts.rig) if rig and a not in at_reference and not mounts.free[a].all()
+    ]
+    return np.column_stack([held, mounts.free[held]]).astype(float)
 
 
 @_kind("moments", "photographs of one moment with others")

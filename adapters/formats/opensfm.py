@@ -37,6 +37,7 @@ from adapters.formats.stated_model import (
     file_in,
     from_vision_axes,
     numbers_of_slots,
+    rigs_of,
     to_vision_axes,
 )
 from adapters.reading.text_lines import Lines, write_lines
@@ -88,12 +89,15 @@ def read_opensfm(path: Path) -> Content:
     cameras = part.entries("cameras")
     stated.cameras = [_camera(name, tree) for name, tree in cameras.items()]
     number = {name: a for a, name in enumerate(cameras)}
-    rigs = _rig_poses(part)
+    rigs = _read_rigs(part, stated)
     for name, shot in part.entries("shots").items():
         of = shot.text("camera")
         if of not in number:
             raise shot.error(f"{shot.place}camera is '{shorten(of)}', which is not among its cameras")
-        R, t = rigs[name] if name in rigs and shot.key("rotation") is None else _pose(shot)
+        if name in rigs:
+            place, instance, pose = rigs[name]
+            stated.on_rig[len(stated.images)] = (place, instance)
+        R, t = pose if name in rigs and shot.key("rotation") is None else _pose(shot)
         stated.add_image(name, number[of], -R.T @ t, from_vision_axes(R))
     points: dict[str, int] = {}
     for name, tree in part.entries("points").items():
@@ -123,16 +127,12 @@ def write_opensfm(folder: Path, content: Content) -> None:
     names = [f"{a + 1} {camera.name}" for a, camera in enumerate(estimate.cameras)]
     rotation = to_vision_axes(estimate.rotation)
     shots = {
-        name: {
-            "camera": names[a],
-            "rotation": Rotation.from_matrix(R).as_rotvec().tolist(),
-            "translation": (-R @ position).tolist(),
-        }
+        name: {"camera": names[a]} | _keys_of_pose(R, -R @ position)
         for name, a, R, position in zip(
             network.images, network.camera.tolist(), rotation, estimate.position, strict=True
         )
     }
-    part = {
+    part: dict[str, Any] = {
         "cameras": {name: _keys_of(camera) for name, camera in zip(names, estimate.cameras, strict=True)},
         "shots": shots,
         "points": {
@@ -140,6 +140,14 @@ def write_opensfm(folder: Path, content: Content) -> None:
             for j, xyz in enumerate(estimate.points.tolist())
         },
     }
+    places, frames = rigs_of(network, estimate)
+    if places:
+        part["rig_cameras"] = {names[a]: _keys_of_pose(*pose) for a, pose in places.items()}
+        part["rig_instances"] = {
+            f"{t}": _keys_of_pose(*frame.pose)
+            | {"rig_camera_ids": {network.images[i]: names[network.camera[i]] for i in frame.photographs}}
+            for t, frame in frames.items()
+        }
     folder.mkdir(parents=True, exist_ok=True)
     with whole_file(folder / RECONSTRUCTION) as file:
         file.write_text(json.dumps([part], indent=1, allow_nan=False) + "\n", encoding="utf-8")
@@ -200,17 +208,22 @@ def _keys_of(camera: Camera) -> dict[str, Any]:
     )
 
 
+def _keys_of_pose(R: FloatArray, t: FloatArray) -> dict[str, Any]:
+    """Return the keys of a pose x = R X + t."""
+    return {"rotation": Rotation.from_matrix(R).as_rotvec().tolist(), "translation": t.tolist()}
+
+
 def _pose(tree: Tree) -> tuple[FloatArray, FloatArray]:
     """Return R (3, 3) and t (3,) of a rotation vector and a translation."""
     vector = tree.numbers(("rotation",), 3)
     return Rotation.from_rotvec(vector).as_matrix(), tree.numbers(("translation",), 3)
 
 
-def _rig_poses(part: Tree) -> dict[str, tuple[FloatArray, FloatArray]]:
-    """Return the poses of the photographs of rigs by their names."""
-    mounts = {name: _pose(tree) for name, tree in part.entries("rig_cameras").items()}
-    poses = {}
-    for instance in part.entries("rig_instances").values():
+def _read_rigs(part: Tree, stated: StatedModel) -> dict[str, tuple[str, str, tuple[FloatArray, FloatArray]]]:
+    """Add the places on rigs, and return place, moment and pose of the photographs of rigs by their names."""
+    mounts = stated.places = {name: _pose(tree) for name, tree in part.entries("rig_cameras").items()}
+    shots = {}
+    for name, instance in part.entries("rig_instances").items():
         R, t = _pose(instance)
         of_shots = instance.below("rig_camera_ids")
         for shot in of_shots.values:
@@ -220,8 +233,8 @@ def _rig_poses(part: Tree) -> dict[str, tuple[FloatArray, FloatArray]]:
                     f"{instance.place}rig_camera_ids: '{shorten(mount)}' is not among the rig_cameras"
                 )
             R_mount, t_mount = mounts[mount]
-            poses[shot] = (R_mount @ R, R_mount @ t + t_mount)
-    return poses
+            shots[shot] = (mount, name, (R_mount @ R, R_mount @ t + t_mount))
+    return shots
 
 
 def _read_tracks(path: Path, stated: StatedModel, points: dict[str, int]) -> None:

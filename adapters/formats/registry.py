@@ -149,7 +149,8 @@ _FRACTION = ("k4", "k5", "k6")  # of full_opencv, in its denominator
 NUMBERS = (False, False)
 _SOLVED = frozenset({"exterior orientations", "object points", "image points", "uncoded"})
 _NAMED = _SOLVED | {"point names", "image names"}
-_SIDE = _NAMED | {"free", "rigs", "moments"}  # stored beside a COLMAP model
+_RIGS = frozenset({"rigs", "moments"})
+_SIDE = _NAMED | _RIGS | {"free", "rig names", "held mounts"}  # stored beside a COLMAP model
 FORMATS = (
     FileFormat(
         name="colmap",
@@ -252,7 +253,7 @@ FORMATS = (
         models=("full_opencv", "opencv", "opencv_fisheye", "radial", "radial_fisheye"),
         read_all=read_opensfm,
         write_all=write_opensfm,
-        keeps=_SOLVED | {"image names"},
+        keeps=_SOLVED | _RIGS | {"image names"},
         folder=True,
         placed=True,
         lacks=_FRACTION,
@@ -300,7 +301,7 @@ FORMATS = (
         models=("full_opencv", "opencv", "opencv_fisheye"),
         read_all=read_alicevision,
         write_all=write_alicevision,
-        keeps=_SOLVED | {"image names"},
+        keeps=_SOLVED | _RIGS | {"image names"},
         placed=True,
         lacks=_FRACTION,
         names=(False, True),
@@ -323,7 +324,7 @@ FORMATS = (
         name="rig",
         models=("opencv",),
         write_all=write_rig_files,
-        keeps=frozenset({"rigs", "unit"}),
+        keeps=frozenset({"rigs", "rig names", "unit"}),
         folder=True,
     ),
     FileFormat(

@@ -11,7 +11,7 @@ from __future__ import annotations
 
 from array import array
 from collections import Counter
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path, PurePosixPath
 
 import numpy as np
@@ -20,11 +20,12 @@ from adapters.formats.cameras.lens_terms import is_rotation, nearest
 from adapters.formats.content import Content
 from adapters.reading.text_lines import MAX_IMAGE_POINTS, MAX_PHOTOGRAPHS, MAX_POINTS, Lines
 from sfm.files.plain_text import MAX_NAME, MAX_SIDE_PX, is_name, shorten
+from sfm.files.result_tables import refuse_moments
 from sfm.model.camera import Camera
 from sfm.model.conventions import VISION_AXES, FloatArray, IntArray
 from sfm.model.display import counted
 from sfm.model.errors import SurveyFileError
-from sfm.model.estimate import Estimate
+from sfm.model.estimate import Estimate, Mounts
 from sfm.model.network import ImagePoints, Network
 from sfm.model.solution import Solution
 
@@ -44,6 +45,9 @@ class StatedModel:
     image: array[int] = field(default_factory=lambda: array("q"))  # photograph of each image point
     point: array[int] = field(default_factory=lambda: array("q"))  # point of each image point
     xy: array[float] = field(default_factory=lambda: array("d"))  # px in Kolinear's frame, one after another
+    # places of cameras on rigs: R (3, 3) and t (3,), x = R x_rig + t in axes x right, y down, z forward
+    places: dict[str, tuple[FloatArray, FloatArray]] = field(default_factory=dict)
+    on_rig: dict[int, tuple[str, str]] = field(default_factory=dict)  # place and moment of photographs
     notes: list[str] = field(default_factory=list)  # on what is read but not used unchanged
     images_named: bool = True  # whether the photographs have names; else they are numbered
     text: Lines | None = None  # the lines being read, for the place of an error
@@ -121,11 +125,13 @@ class StatedModel:
 def content_of(stated: StatedModel) -> Content:
     """Return a stated model as a survey; points are uncoded, since these programs number them.
 
-    The same point twice in one photograph is read once, as the first of both, and noted.
+    The same point twice in one photograph is read once, as the first of both, and noted. Places that share
+    photographs of one moment make a rig. A camera at several places becomes one at each, with the same
+    interior orientation.
 
     Raises:
         SurveyFileError: two photographs or points have one name, a name leaves the folder of the photographs,
-            or nothing is in the file.
+            two photographs are of one place and moment, or nothing is in the file.
     """
     images = _names_below(stated)
     for what, names in (("photograph", images), ("point", stated.points)):
@@ -158,10 +164,71 @@ def content_of(stated: StatedModel) -> Content:
         np.array(stated.rotation, dtype=float).reshape(-1, 3, 3),
         np.array(stated.xyz, dtype=float).reshape(-1, 3),
     )
+    network, estimate = _with_rigs(stated, network, estimate)
     solution = Solution(
         stated.path.name, network, estimate, points_named=False, images_named=stated.images_named
     )
     return Content(solution, notes=tuple(notes))
+
+
+def _with_rigs(stated: StatedModel, network: Network, estimate: Estimate) -> tuple[Network, Estimate]:
+    """Return the network and estimate with the rigs of a stated model."""
+    rigs = _joined_places(stated)
+    if not rigs:
+        return network, estimate
+    of_photograph: dict[int, tuple[int, str]] = {}  # rig and place
+    for i, (place, _) in stated.on_rig.items():
+        rig = next((number for number, of_rig in enumerate(rigs) if place in of_rig), None)
+        if rig is not None:
+            of_photograph[i] = (rig, place)
+    # a camera for each place of one of the file, in its order; -1 and "" off the rigs
+    keys = sorted({(a, *of_photograph.get(i, (-1, ""))) for i, a in enumerate(stated.camera)})
+    keys += [(a, -1, "") for a in range(len(stated.cameras)) if a not in stated.camera]
+    keys.sort(key=lambda key: key[0])
+    number = {key: k for k, key in enumerate(keys)}
+    parts = Counter(a for a, _, _ in keys)
+    cameras = []
+    for a, _, place in keys:
+        camera = stated.cameras[a]
+        if parts[a] > 1:
+            shared = (camera.name,) * len(camera.names)
+            camera = replace(camera, name=f"{camera.name} {place}".strip(), shared=shared)
+        cameras.append(camera)
+    position, rotation = np.zeros((len(keys), 3)), np.tile(np.eye(3), (len(keys), 1, 1))
+    free = np.zeros((len(keys), 6), dtype=bool)
+    references = [next(place for place in stated.places if place in of_rig) for of_rig in rigs]
+    for k, (_, rig, place) in enumerate(keys):
+        if rig >= 0 and place != references[rig]:
+            (R0, t0), (R, t) = stated.places[references[rig]], stated.places[place]
+            R = R @ R0.T
+            rotation[k] = VISION_AXES @ R.T @ VISION_AXES
+            position[k], free[k] = -VISION_AXES @ R.T @ (t - R @ t0), True
+    names = tuple(f"rig {rig + 1}" if rig >= 0 else "" for _, rig, _ in keys)
+    mounts = Mounts(position, rotation, free, names)
+    camera_of = [number[(a, *of_photograph.get(i, (-1, "")))] for i, a in enumerate(stated.camera)]
+    when = [
+        (of_photograph[i][0], stated.on_rig[i][1]) if i in of_photograph else (-1, f"{i}")
+        for i in range(len(stated.images))
+    ]
+    order = {moment: t for t, moment in enumerate(dict.fromkeys(when))}
+    moment = np.array([order[key] for key in when], dtype=np.int64)
+    network = replace(network, camera=np.array(camera_of, dtype=np.int64))
+    refuse_moments(f"{stated.path}: rigs", [camera.name for camera in cameras], network, mounts, moment)
+    return replace(network, moment=moment), replace(estimate, cameras=tuple(cameras), mounts=mounts)
+
+
+def _joined_places(stated: StatedModel) -> list[set[str]]:
+    """Return the places of each rig: those that photographs of one moment join."""
+    at: dict[str, set[str]] = {}
+    for place, moment in stated.on_rig.values():
+        at.setdefault(moment, set()).add(place)
+    rigs = list[set[str]]()
+    for places in at.values():
+        if len(places) > 1:
+            joined = [rig for rig in rigs if rig & places]
+            rigs = [rig for rig in rigs if not rig & places] + [places.union(*joined)]
+    order = {place: k for k, place in enumerate(stated.places)}
+    return sorted(rigs, key=lambda rig: min(order[place] for place in rig))
 
 
 def file_in(folder: Path, *names: str) -> Path | None:
@@ -179,6 +246,42 @@ def file_in(folder: Path, *names: str) -> Path | None:
                 )
             return path
     return None
+
+
+@dataclass(frozen=True)
+class Frame:
+    """A moment of a rig."""
+
+    pose: tuple[FloatArray, FloatArray]  # R (3, 3) and t (3,), x_rig = R X + t, x right, y down, z forward
+    photographs: list[int]
+
+
+def rigs_of(
+    network: Network, estimate: Estimate
+) -> tuple[dict[int, tuple[FloatArray, FloatArray]], dict[int, Frame]]:
+    """Return the places of the cameras on rigs by their indices, and the moments of these rigs by number.
+
+    A place is R (3, 3) and t (3,), x = R x_rig + t in axes x right, y down, z forward; a rig has the axes of
+    its reference camera.
+    """
+    mounts = estimate.mounts
+    if mounts is None or network.moment is None:
+        return {}, {}
+    places = {}
+    for a, rig in enumerate(mounts.rig):
+        if rig:
+            R = VISION_AXES @ mounts.rotation[a].T @ VISION_AXES
+            places[a] = (R, -R @ VISION_AXES @ mounts.position[a])
+    frames: dict[int, Frame] = {}
+    rotation = to_vision_axes(estimate.rotation)
+    for i, (t, a) in enumerate(zip(network.moment.tolist(), network.camera.tolist(), strict=True)):
+        if a not in places:
+            continue
+        if t not in frames:
+            R, shift = places[a]
+            frames[t] = Frame((R.T @ rotation[i], R.T @ (-rotation[i] @ estimate.position[i] - shift)), [])
+        frames[t].photographs.append(i)
+    return places, frames
 
 
 def from_vision_axes(R: FloatArray) -> FloatArray:

@@ -14,7 +14,7 @@ from sfm.cli.survey_runs import lock_folder, reporting_unfinished
 from sfm.runtime.faults import working_on
 
 SHOWN = 4  # sections of the page whose tables are printed
-# of what a format may have, by its names in `adapters.formats.content`; rigs have a note of their own
+# of what a format may have, by its names in `adapters.formats.content`
 NOT_USED = (
     "exterior", "interior", "checks", "rejected", "image covariances", "shared", "unplaced",
 )  # fmt: skip
@@ -31,7 +31,7 @@ def audit(
         typer.Option(
             "--survey",
             metavar="FILE",
-            help="Survey file with control, scale bars and tables of the model's points.",
+            help="Survey file with cameras, rigs, control, scale bars and tables for the model.",
         ),
     ] = None,
     fix: Annotated[

@@ -17,7 +17,7 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from adapters.formats.content import Content, losses
+from adapters.formats.content import KINDS, Content, losses
 from adapters.formats.registry import (
     describe_stored,
     format_named,
@@ -35,6 +35,7 @@ from sfm.model.network import Network
 from sfm.model.reduced_network import reduce_network
 from sfm.model.solution import Solution
 from tests.places import SHARED
+from tests.rigs import make_rig
 from tests.synthetic import make_network, seed_of
 
 FORMATS = SHARED / "data" / "formats"
@@ -508,6 +509,79 @@ def test_rigs_of_opensfm_and_alicevision_have_poses(tmp_path: Path) -> None:
     scene_path.write_text(json.dumps(scene))
     rigged = read_content(scene_path).result.estimate
     np.testing.assert_allclose(rigged.position, plain.position, atol=1e-12)
+
+
+def rigged_model(name: str, *, cameras: int) -> Content:
+    """A rig of some cameras in a lens model that the formats have, and one photograph of a camera alone."""
+    network, truth = make_rig(seed_of(name), cameras=cameras, moments=4)
+    lens = make_network(seed_of(name), model="opencv", free=())[1].cameras[0]
+    of_rig = tuple(replace(lens, name=camera.name) for camera in truth.cameras)
+    moment = network.moment.copy()
+    moment[-1] = moment.max() + 1  # one photograph without companions of its moment
+    points = tuple(f"u{j}" for j in range(len(network.points)))
+    return Content(
+        Solution(
+            "rig",
+            replace(network, moment=moment, points=points),
+            replace(truth, cameras=of_rig),
+            points_named=False,
+        )
+    )
+
+
+@pytest.mark.parametrize("form", ["colmap", "opensfm", "alicevision", "tables"])
+@pytest.mark.parametrize("cameras", [2, 3])
+def test_rigs_are_read_as_they_are_written(form: str, cameras: int, tmp_path: Path) -> None:
+    content = rigged_model(f"round trip {cameras}", cameras=cameras)
+    write_content(tmp_path / "rig", form, content)
+    again = read_content(tmp_path / "rig", form)
+    before, after = content.result, again.result
+    first, second = before.estimate.mounts, after.estimate.mounts
+    assert first is not None and second is not None
+    for kind in KINDS:
+        if kind.name in ("rigs", "moments"):
+            assert (
+                kind.name in format_named(form).keeps and len(kind.rows(content)) == len(kind.rows(again)) > 0
+            )
+            np.testing.assert_allclose(kind.rows(again), kind.rows(content), atol=1e-12)
+    assert after.network.moment is not None and before.network.moment is not None
+    together = before.network.moment[:, None] == before.network.moment
+    np.testing.assert_array_equal(after.network.moment[:, None] == after.network.moment, together)
+    np.testing.assert_allclose(after.estimate.position, before.estimate.position, atol=1e-12)
+    np.testing.assert_allclose(after.estimate.rotation, before.estimate.rotation, atol=1e-12)
+    lost = {kind.name for kind, _ in losses(content, format_named(form).held(content))}
+    assert ("rig names" in lost) == (form in ("opensfm", "alicevision"))
+
+
+def test_a_camera_at_two_places_of_a_rig_is_one_at_each(tmp_path: Path) -> None:
+    """OpenSfM's rigs may share the interior orientation of their cameras."""
+    content = rigged_model("one lens", cameras=2)
+    write_content(tmp_path / "rig", "opensfm", content)
+    file = tmp_path / "rig" / "reconstruction.json"
+    (part,) = json.loads(file.read_text())
+    first, second = part["cameras"]
+    for shot in part["shots"].values():
+        shot["camera"] = first
+    del part["cameras"][second]
+    file.write_text(json.dumps([part]))
+    result = read_content(tmp_path / "rig").result
+    cameras, mounts = result.estimate.cameras, result.estimate.mounts
+    assert [camera.shared_name for camera in cameras] == [first, first] and mounts is not None
+    assert {camera.name for camera in cameras} == {f"{first} {first}", f"{first} {second}"}
+    np.testing.assert_array_equal(result.network.camera, content.result.network.camera)
+    np.testing.assert_allclose(mounts.position, content.result.estimate.mounts.position, atol=1e-12)
+
+
+def test_a_rig_with_two_photographs_at_one_place_and_moment_is_refused(tmp_path: Path) -> None:
+    write_content(tmp_path / "rig", "opensfm", rigged_model("twice", cameras=2))
+    file = tmp_path / "rig" / "reconstruction.json"
+    (part,) = json.loads(file.read_text())
+    ids = part["rig_instances"]["0"]["rig_camera_ids"]
+    ids |= {next(iter(part["rig_instances"]["1"]["rig_camera_ids"])): next(iter(ids.values()))}
+    del part["rig_instances"]["1"]
+    file.write_text(json.dumps([part]))
+    with pytest.raises(SurveyFileError, match=r"rigs: photographs .* are of one moment; needed different"):
+        read_content(tmp_path / "rig")
 
 
 def test_older_scenes_of_alicevision(tmp_path: Path) -> None:
