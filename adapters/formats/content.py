@@ -40,6 +40,7 @@ class Content:
     sigma0_px: float | None = None  # a posteriori, of an image coordinate, px
     stated_weights: bool = False  # whether its program weights all observations as it states them
     notes: tuple[str, ...] = ()  # remarks on content that is read but not used unchanged
+    crs: str = ""  # coordinate system of the object in well-known text; empty where unknown
 
 
 Rows = Callable[[Content], FloatArray]
@@ -292,6 +293,11 @@ def _unit(content: Content) -> FloatArray:
     return _word(content.result.unit)
 
 
+@_kind("crs", "coordinate system")
+def _crs(content: Content) -> FloatArray:
+    return _word(content.crs)
+
+
 @_kind("point names", "names of points")
 def _point_names(content: Content) -> FloatArray:
     return _names(content.result.network.points, content.result.points_named)
@@ -341,6 +347,41 @@ ALL = frozenset(kind.name for kind in KINDS)
 CONVERTED = frozenset(
     {"interior", "interior correlations", "interior sigmas", "covariances", "rig covariance"}
 )
+
+
+def content_of_points(
+    name: str,
+    xyz: FloatArray,
+    sigma: FloatArray | None,
+    *,
+    unit: str = "",
+    crs: str = "",
+    notes: tuple[str, ...] = (),
+) -> Content:
+    """Return points alone, which a file only numbers, as a survey.
+
+    Args:
+        name: of the survey.
+        xyz: coordinates, object unit, (n, 3).
+        sigma: their standard deviations, object unit, (n, 3); None if they are not known.
+        unit: object unit; empty where unknown.
+        crs: coordinate system in well-known text; empty where unknown.
+        notes: remarks on what is read but not used unchanged.
+    """
+    none = np.zeros(0, dtype=np.int64)
+    network = Network((), none, tuple(f"u{j}" for j in range(len(xyz))), _no_image_points())
+    estimate = Estimate((), np.zeros((0, 3)), np.zeros((0, 3, 3)), xyz)
+    C = None if sigma is None else np.eye(3) * sigma[:, None, :] ** 2
+    return Content(Solution(name, network, estimate, C, unit=unit, points_named=False), notes=notes, crs=crs)
+
+
+def points_of(content: Content) -> tuple[FloatArray, FloatArray | None]:
+    """Return the points that have coordinates, (n, 3), and their standard deviations, if all have them."""
+    result = content.result
+    known = result.estimate.determined
+    C = result.point_covariance
+    sigma = None if C is None else np.sqrt(np.diagonal(C, axis1=1, axis2=2))[known]
+    return result.estimate.points[known], None if sigma is None or not np.isfinite(sigma).all() else sigma
 
 
 def with_cameras(content: Content, network: Network, estimate: Estimate) -> tuple[Content, frozenset[str]]:

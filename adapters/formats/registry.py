@@ -35,6 +35,10 @@ from adapters.formats.bundler import PLACES as BUNDLER_PLACES
 from adapters.formats.bundler import read_bundler, write_bundler
 from adapters.formats.cameras.rig_folder import write_rig_files
 from adapters.formats.content import ALL, Content, losses, refuse_not_finite, select_placed
+from adapters.formats.e57 import HEAD as E57_HEAD
+from adapters.formats.e57 import read_e57, write_e57
+from adapters.formats.las import HEAD as LAS_HEAD
+from adapters.formats.las import read_laz, write_laz
 from adapters.formats.metashape import read_metashape, write_metashape
 from adapters.formats.nerfstudio import read_nerfstudio_poses, write_nerfstudio_poses
 from adapters.formats.nvm import HEADER as NVM_HEADER
@@ -120,7 +124,7 @@ class FileFormat:
     @property
     def readable(self) -> bool:
         """Whether it has photographs and can be read."""
-        return self.read is not None or self.read_all is not None
+        return not self.only_points and (self.read is not None or self.read_all is not None)
 
 
 def _read_database(path: Path) -> tuple[Network, Estimate]:
@@ -149,6 +153,7 @@ _FRACTION = ("k4", "k5", "k6")  # of full_opencv, in its denominator
 NUMBERS = (False, False)
 _SOLVED = frozenset({"exterior orientations", "object points", "image points", "uncoded"})
 _NAMED = _SOLVED | {"point names", "image names"}
+_CLOUD = frozenset({"object points", "point sigmas", "crs"})
 _RIGS = frozenset({"rigs", "moments"})
 _SIDE = _NAMED | _RIGS | {"free", "rig names", "held mounts"}  # stored beside a COLMAP model
 FORMATS = (
@@ -183,7 +188,7 @@ FORMATS = (
         models=tuple(MODELS),
         read_all=read_tables,
         write_all=_write_tables,
-        keeps=ALL - {"exterior correlations", "interior correlations", "unplaced"},
+        keeps=ALL - {"exterior correlations", "interior correlations", "unplaced", "crs"},
         folder=True,
         placed=True,
     ),
@@ -328,6 +333,26 @@ FORMATS = (
         folder=True,
     ),
     FileFormat(
+        name="laz",
+        models=(),
+        read_all=read_laz,
+        write_all=write_laz,
+        keeps=_CLOUD,
+        placed=True,
+        names=NUMBERS,
+        recognises=lambda head: head.startswith(LAS_HEAD),
+    ),
+    FileFormat(
+        name="e57",
+        models=(),
+        read_all=read_e57,
+        write_all=write_e57,
+        keeps=_CLOUD,
+        placed=True,
+        names=NUMBERS,
+        recognises=lambda head: head.startswith(E57_HEAD),
+    ),
+    FileFormat(
         name="ply",
         models=(),
         write_all=_write_ply,
@@ -338,6 +363,9 @@ FORMATS = (
 ENDINGS = {
     ".xml": "metashape",
     ".ply": "ply",
+    ".laz": "laz",
+    ".las": "laz",
+    ".e57": "e57",
     ".db": "colmap-database",
     ".nvm": "nvm",
     ".sfm": "alicevision",
@@ -447,7 +475,7 @@ def read_content(path: Path, name: str | None = None, *, control: Path | None = 
         SurveyFileError: with file and line number.
     """
     form = format_of(path) if name is None else format_named(name)
-    if not form.readable:
+    if form.read is None and form.read_all is None:
         raise SurveyFileError(f"{path}: format {form.name} has no photographs, it can only be written")
     if control is not None and not form.control:
         raise SurveyFileError(f"{path}: format {form.name} takes no control file, photomodeler does")

@@ -1,0 +1,167 @@
+"""Point clouds as E57, by pye57 of the extra kolinear[exchange].
+
+    cartesianX, cartesianY, cartesianZ     in metres, as the standard demands, double precision
+    kolinear:sX, kolinear:sY, kolinear:sZ  extension: standard deviations of the coordinates, m
+    coordinateMetadata                     coordinate system in well-known text, if it is known
+
+Coordinates in a known unit are written in metres; without one, as they are. Names of points are not stored.
+All scans of a file are read, in its coordinates, without points that it marks as invalid.
+
+Source: ASTM E2807-11, Standard Specification for 3D Imaging Data Exchange.
+"""
+
+from __future__ import annotations
+
+import uuid
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from adapters.formats.content import Content, content_of_points, points_of
+from adapters.formats.las import reason_of
+from adapters.reading.text_lines import MAX_POINTS
+from sfm.files.csv_tables import MAX_NUMBER
+from sfm.files.whole_files import whole_file
+from sfm.model.conventions import METRES, FloatArray
+from sfm.model.errors import MissingLibraryError, OutputError, SurveyFileError
+
+HEAD = "ASTM-E57"  # first bytes of a file
+EXTENSION, URI = "kolinear", "urn:kolinear:standard-deviations:1"
+AXES = ("cartesianX", "cartesianY", "cartesianZ")
+SIGMAS = tuple(f"{EXTENSION}:s{axis}" for axis in "XYZ")
+
+
+def load_pye57() -> Any:
+    """Return pye57.
+
+    Raises:
+        MissingLibraryError: pye57 is not installed.
+    """
+    try:
+        import pye57
+    except ImportError as error:
+        raise MissingLibraryError(
+            "format e57 needs pye57; install it with: pip install 'kolinear[exchange]'"
+        ) from error
+    return pye57
+
+
+def read_e57(path: Path) -> Content:
+    """Read the points of all scans, in m, with standard deviations if all scans have them.
+
+    Raises:
+        SurveyFileError: damaged, too many points, or a coordinate that is no reasonable number.
+        MissingLibraryError: pye57 is not installed.
+    """
+    pye57 = load_pye57()
+    scans: list[FloatArray] = []
+    sigmas: list[FloatArray | None] = []
+    try:
+        with pye57.E57(str(path)) as file:
+            headers = [file.get_header(k) for k in range(file.scan_count)]
+            if sum(header.point_count for header in headers) > MAX_POINTS:
+                raise SurveyFileError(f"{path}: more than {MAX_POINTS} points, no more are read")
+            for k, header in enumerate(headers):
+                if not header.point_count:
+                    continue
+                data = file.read_scan(k, ignore_missing_fields=True)
+                scans.append(np.column_stack([np.asarray(data[axis], dtype=float) for axis in AXES]))
+                stated = set(header.point_fields).issuperset(SIGMAS) and len(scans[-1]) == header.point_count
+                sigmas.append(_read_fields(pye57, file, header, SIGMAS) if stated else None)
+            root = file.image_file.root()
+            crs = root["coordinateMetadata"].value() if root.isDefined("coordinateMetadata") else ""
+    except SurveyFileError:
+        raise
+    except Exception as error:  # libe57 and pye57 document no set of errors for damaged files
+        raise SurveyFileError(f"{path}: no readable E57 file ({reason_of(error)})") from error
+    if not scans:
+        raise SurveyFileError(f"{path}: no points are in it")
+    xyz = np.concatenate(scans)
+    if not (np.abs(xyz) <= MAX_NUMBER).all():
+        raise SurveyFileError(f"{path}: a coordinate is not a finite number of at most {MAX_NUMBER:g}")
+    known = [sigma for sigma in sigmas if sigma is not None]
+    sigma = np.concatenate(known) if len(known) == len(sigmas) else None
+    return content_of_points(path.name, xyz, sigma, unit="m", crs=crs)
+
+
+def write_e57(path: Path, content: Content) -> None:
+    """Write the points that have coordinates as one scan.
+
+    Raises:
+        OutputError: the file cannot be written.
+        MissingLibraryError: pye57 is not installed.
+    """
+    pye57 = load_pye57()
+    lib = pye57.libe57
+    xyz, sigma = points_of(content)
+    metres = METRES.get(content.result.unit, 1.0)
+    columns = dict(zip(AXES, (metres * xyz).T, strict=True))
+    if sigma is not None:
+        columns |= dict(zip(SIGMAS, (metres * sigma).T, strict=True))
+    with whole_file(path) as part:
+        image = lib.ImageFile(str(part), "w")
+        try:
+            _write_scan(lib, image, content, columns)
+        except lib.E57Exception as error:
+            raise OutputError(f"{path}: cannot be written ({reason_of(error)})") from error
+        finally:
+            image.close()
+
+
+def _write_scan(lib: Any, image: Any, content: Content, columns: dict[str, FloatArray]) -> None:
+    """Write columns of numbers as the only scan of a file."""
+
+    def structure(**values: float) -> Any:
+        node = lib.StructureNode(image)
+        for name, value in values.items():
+            node.set(name, lib.FloatNode(image, value))
+        return node
+
+    root, scan, bounds, prototype = image.root(), structure(), structure(), structure()
+    image.extensionsAdd("", lib.E57_V1_0_URI)
+    image.extensionsAdd(EXTENSION, URI)
+    created = structure(dateTimeValue=0.0)
+    created.set("isAtomicClockReferenced", lib.IntegerNode(image, 0))
+    scans = lib.VectorNode(image, True)
+    for name, node in (
+        ("formatName", lib.StringNode(image, "ASTM E57 3D Imaging Data File")),
+        ("guid", lib.StringNode(image, f"{{{uuid.uuid4()}}}")),
+        ("versionMajor", lib.IntegerNode(image, lib.E57_FORMAT_MAJOR)),
+        ("versionMinor", lib.IntegerNode(image, lib.E57_FORMAT_MINOR)),
+        ("e57LibraryVersion", lib.StringNode(image, lib.E57_LIBRARY_ID)),
+        ("coordinateMetadata", lib.StringNode(image, content.crs)),
+        ("creationDateTime", created),
+        ("data3D", scans),
+        ("images2D", lib.VectorNode(image, True)),
+    ):
+        root.set(name, node)
+    scan.set("guid", lib.StringNode(image, f"{{{uuid.uuid4()}}}"))
+    scan.set("name", lib.StringNode(image, content.result.name))
+    buffers = lib.VectorSourceDestBuffer()
+    arrays = {name: np.ascontiguousarray(values) for name, values in columns.items()}
+    for name, values in arrays.items():
+        low, high = float(values.min()), float(values.max())
+        prototype.set(name, lib.FloatNode(image, low, lib.E57_DOUBLE, low, high))
+        buffers.append(lib.SourceDestBuffer(image, name, values, len(values), True, True))
+        if name in AXES:
+            axis = name[-1].lower()
+            bounds.set(f"{axis}Minimum", lib.FloatNode(image, low))
+            bounds.set(f"{axis}Maximum", lib.FloatNode(image, high))
+    scan.set("cartesianBounds", bounds)
+    points = lib.CompressedVectorNode(image, prototype, lib.VectorNode(image, True))
+    scan.set("points", points)
+    scans.append(scan)
+    writer = points.writer(buffers)
+    writer.write(len(next(iter(arrays.values()))))
+    writer.close()
+
+
+def _read_fields(pye57: Any, file: Any, header: Any, names: tuple[str, ...]) -> FloatArray:
+    """Return fields of a scan that pye57 does not know, (n, fields)."""
+    lib, count = pye57.libe57, header.point_count
+    arrays, buffers = [np.empty(count) for _ in names], pye57.libe57.VectorSourceDestBuffer()
+    for name, values in zip(names, arrays, strict=True):
+        buffers.append(lib.SourceDestBuffer(file.image_file, name, values, count, True, True))
+    header.points.reader(buffers).read()
+    return np.column_stack(arrays)
