@@ -176,45 +176,50 @@ def _with_rigs(stated: StatedModel, network: Network, estimate: Estimate) -> tup
     rigs = _joined_places(stated)
     if not rigs:
         return network, estimate
-    of_photograph: dict[int, tuple[int, str]] = {}  # rig and place
-    for i, (place, _) in stated.on_rig.items():
-        rig = next((number for number, of_rig in enumerate(rigs) if place in of_rig), None)
-        if rig is not None:
-            of_photograph[i] = (rig, place)
-    # a camera for each place of one of the file, in its order; -1 and "" off the rigs
-    keys = sorted({(a, *of_photograph.get(i, (-1, ""))) for i, a in enumerate(stated.camera)})
-    keys += [(a, -1, "") for a in range(len(stated.cameras)) if a not in stated.camera]
-    keys.sort(key=lambda key: key[0])
-    number = {key: k for k, key in enumerate(keys)}
-    parts = Counter(a for a, _, _ in keys)
-    cameras = []
-    for a, _, place in keys:
-        camera = stated.cameras[a]
-        if parts[a] > 1:
-            shared = (camera.name,) * len(camera.names)
-            camera = replace(camera, name=f"{camera.name} {place}".strip(), shared=shared)
-        cameras.append(camera)
-    position, rotation = np.zeros((len(keys), 3)), np.tile(np.eye(3), (len(keys), 1, 1))
-    free = np.zeros((len(keys), 6), dtype=bool)
-    references = [next(place for place in stated.places if place in of_rig) for of_rig in rigs]
-    for k, (_, rig, place) in enumerate(keys):
-        if rig >= 0 and place != references[rig]:
-            (R0, t0), (R, t) = stated.places[references[rig]], stated.places[place]
+    rig_of = {place: rig for rig, places in enumerate(rigs) for place in places}
+    place_of = {i: place for i, (place, _) in stated.on_rig.items() if place in rig_of}  # by photograph
+    # a camera for each place of one of the file, in its order; "" off the rigs
+    lens_and_place = [(a, place_of.get(i, "")) for i, a in enumerate(stated.camera)]
+    idle = [(a, "") for a in range(len(stated.cameras)) if a not in stated.camera]
+    order = {place: k for k, place in enumerate(stated.places)}
+    keys = sorted({*lens_and_place, *idle}, key=lambda key: (key[0], order.get(key[1], -1)))
+    number, parts = {key: k for k, key in enumerate(keys)}, Counter(a for a, _ in keys)
+    cameras = tuple(
+        stated.cameras[a] if parts[a] == 1 else _mounted(stated.cameras[a], place) for a, place in keys
+    )
+    mounts = _mounts(stated, [place for _, place in keys], rig_of)
+    when: list[object] = [
+        (rig_of[place_of[i]], stated.on_rig[i][1]) if i in place_of else i for i in range(len(stated.images))
+    ]
+    moments = {key: t for t, key in enumerate(dict.fromkeys(when))}
+    moment = np.array([moments[key] for key in when], dtype=np.int64)
+    network = replace(network, camera=np.array([number[key] for key in lens_and_place], dtype=np.int64))
+    refuse_moments(f"{stated.path}: rigs", [camera.name for camera in cameras], network, mounts, moment)
+    return replace(network, moment=moment), replace(estimate, cameras=cameras, mounts=mounts)
+
+
+def _mounted(camera: Camera, place: str) -> Camera:
+    """Return a camera at one of its places, which share its interior orientation."""
+    shared = (camera.name,) * len(camera.names)
+    return replace(camera, name=f"{camera.name} {place}".strip(), shared=shared)
+
+
+def _mounts(stated: StatedModel, places: list[str], rig_of: dict[str, int]) -> Mounts:
+    """Return the mounts of cameras at some places, "" off the rigs; a rig has the axes of its first place."""
+    position, rotation = np.zeros((len(places), 3)), np.tile(np.eye(3), (len(places), 1, 1))
+    free = np.zeros((len(places), 6), dtype=bool)
+    reference: dict[int, str] = {}
+    for place in stated.places:
+        if place in rig_of:
+            reference.setdefault(rig_of[place], place)
+    for k, place in enumerate(places):
+        if place and place != reference[rig_of[place]]:
+            (R0, t0), (R, t) = stated.places[reference[rig_of[place]]], stated.places[place]
             R = R @ R0.T
             rotation[k] = VISION_AXES @ R.T @ VISION_AXES
             position[k], free[k] = -VISION_AXES @ R.T @ (t - R @ t0), True
-    names = tuple(f"rig {rig + 1}" if rig >= 0 else "" for _, rig, _ in keys)
-    mounts = Mounts(position, rotation, free, names)
-    camera_of = [number[(a, *of_photograph.get(i, (-1, "")))] for i, a in enumerate(stated.camera)]
-    when = [
-        (of_photograph[i][0], stated.on_rig[i][1]) if i in of_photograph else (-1, f"{i}")
-        for i in range(len(stated.images))
-    ]
-    order = {moment: t for t, moment in enumerate(dict.fromkeys(when))}
-    moment = np.array([order[key] for key in when], dtype=np.int64)
-    network = replace(network, camera=np.array(camera_of, dtype=np.int64))
-    refuse_moments(f"{stated.path}: rigs", [camera.name for camera in cameras], network, mounts, moment)
-    return replace(network, moment=moment), replace(estimate, cameras=tuple(cameras), mounts=mounts)
+    names = tuple(f"rig {rig_of[place] + 1}" if place else "" for place in places)
+    return Mounts(position, rotation, free, names)
 
 
 def _joined_places(stated: StatedModel) -> list[set[str]]:

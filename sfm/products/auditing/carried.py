@@ -17,6 +17,7 @@ from sfm.files.result_tables import MOMENTS
 from sfm.model.camera import Camera
 from sfm.model.conventions import METRES, BoolArray, IntArray, angles_from_rotation
 from sfm.model.display import counted, listed
+from sfm.model.estimate import Mounts
 from sfm.model.network import rows_of
 from sfm.model.solution import Solution
 from sfm.survey.inputs.cameras import cameras_of_images
@@ -253,12 +254,18 @@ def _add_rigs_of_model(
         taken.add(rig)
         carried.rigs.append(RigSettings(name=rig, cameras=tuple(names[a] for a in on), moment=MOMENTS))
         carried.moments |= {network.images[used[i]]: f"{moment[i]}" for i in rows}
-        held = np.array([a for a in on[1:] if not mounts.free[a].any()], dtype=np.int64)
-        angles = np.array([angles_from_rotation(mounts.rotation[a]) for a in held]).reshape(-1, 3)
-        clear = np.abs(np.cos(angles[:, 1])) >= MIN_COS_PHI
-        if len(held) and clear.all() and (given is None or model.unit in METRES):
-            position, held_names = mounts.position[held], [names[a] for a in held]
-            table = ObservedExterior.from_arrays(held_names, position, 0.0, np.degrees(angles), 0.0)
+        held = [a for a in on[1:] if not mounts.free[a].any()]
+        table = _held_mounts(mounts, held, names) if given is None or model.unit in METRES else None
+        if table is not None:
             carried.mounts.append(table)
-        elif len(held):
+        elif held:
             carried.of_model.append(f"that mounts of rig {rig} are held")
+
+
+def _held_mounts(mounts: Mounts, held: Sequence[int], names: Sequence[str]) -> ObservedExterior | None:
+    """Return mounts that are held fixed; None for none, or if omega and kappa of one cannot be told apart."""
+    angles = np.array([angles_from_rotation(mounts.rotation[a]) for a in held]).reshape(-1, 3)
+    if not held or (np.abs(np.cos(angles[:, 1])) < MIN_COS_PHI).any():
+        return None
+    position, held_names = mounts.position[list(held)], [names[a] for a in held]
+    return ObservedExterior.from_arrays(held_names, position, 0.0, np.degrees(angles), 0.0)

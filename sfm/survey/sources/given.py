@@ -92,11 +92,7 @@ def read_tables(survey: Survey, tables: tuple[Observations, ...], files: Photogr
     images, image = _numbered(names, order=started)
     refuse_many(str(tables[0].table.path), images)
     points, point = _numbered([name for table in tables for name in table.point])
-    camera_of = dict(zip(files.names, files.camera.tolist(), strict=True))
-    without_file = [name for name in images if name not in camera_of]
-    others = camera_of_images(survey.cameras, without_file, survey.source)
-    camera_of |= dict(zip(without_file, others, strict=True))
-    owner = np.array([camera_of[name] for name in images], dtype=np.int64)
+    owner = _cameras_of(survey, files, images)
     refuse_ungrouped(survey.cameras, images, owner, survey.source)
     parts, outside_parts, first = [], [], 0
     for number, table in enumerate(tables):
@@ -182,6 +178,15 @@ def _merge_tables(
         ),
         once.remarks,
     )
+
+
+def _cameras_of(survey: Survey, files: PhotographList, images: Sequence[str]) -> IntArray:
+    """Return the camera of each photograph: that of its file, or by its name, (m,)."""
+    camera_of = dict(zip(files.names, files.camera.tolist(), strict=True))
+    without_file = [name for name in images if name not in camera_of]
+    others = camera_of_images(survey.cameras, without_file, survey.source)
+    camera_of |= dict(zip(without_file, others, strict=True))
+    return np.array([camera_of[name] for name in images], dtype=np.int64)
 
 
 def _numbered(names: Sequence[str], *, order: Sequence[str] = ()) -> tuple[tuple[str, ...], IntArray]:
