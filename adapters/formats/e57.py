@@ -22,7 +22,7 @@ from adapters.formats.content import Content, content_of_points, points_of
 from adapters.formats.las import reason_of
 from adapters.reading.text_lines import MAX_POINTS
 from sfm.files.csv_tables import MAX_NUMBER
-from sfm.files.whole_files import whole_file
+from sfm.files.whole_files import refuse_full, whole_file
 from sfm.model.conventions import METRES, FloatArray
 from sfm.model.errors import MissingLibraryError, OutputError, SurveyFileError
 
@@ -100,13 +100,15 @@ def write_e57(path: Path, content: Content) -> None:
     if sigma is not None:
         columns |= dict(zip(SIGMAS, (metres * sigma).T, strict=True))
     with whole_file(path) as part:
-        image = lib.ImageFile(str(part), "w")
         try:
-            _write_scan(lib, image, content, columns)
+            image = lib.ImageFile(str(part), "w")
+            try:
+                _write_scan(lib, image, content, columns)
+            finally:
+                image.close()
         except lib.E57Exception as error:
+            refuse_full(part.parent)
             raise OutputError(f"{path}: cannot be written ({reason_of(error)})") from error
-        finally:
-            image.close()
 
 
 def _write_scan(lib: Any, image: Any, content: Content, columns: dict[str, FloatArray]) -> None:

@@ -16,7 +16,7 @@ import pytest
 from adapters.colmap.camera_models import read_scene, write_scene
 from adapters.colmap.model_files import check_model_files
 from adapters.formats.content import Content
-from adapters.formats.registry import FORMATS, write_content
+from adapters.formats.registry import FORMATS, read_content, write_content
 from sfm.adjustment.solve import adjust
 from sfm.model.camera import camera_from_values
 from sfm.model.conventions import AnyArray
@@ -24,6 +24,7 @@ from sfm.model.errors import OutputError
 from sfm.model.network import ObjectPoints
 from sfm.model.observations.control_and_bars import InteriorObservations
 from sfm.model.observations.pose import ExteriorObservations
+from tests.adapters.formats.clouds import library
 from tests.synthetic import make_network
 
 pycolmap = pytest.importorskip("pycolmap")
@@ -116,6 +117,10 @@ def _refuse_not_finite(path: Path) -> None:
                     column = {"cameras": "params", "keypoints": "data"}[table]
                     for (blob,) in database.execute(f"SELECT {column} FROM {table}"):
                         assert np.isfinite(np.frombuffer(blob, kind)).all(), table
+        elif file.read_bytes().startswith((b"LASF", b"ASTM-E57")):
+            cloud = read_content(file).result
+            assert np.isfinite(cloud.estimate.points).all()
+            assert cloud.point_covariance is None or np.isfinite(cloud.point_covariance).all()
         elif file.suffix != ".bin":
             text = file.read_text(encoding="utf-8")
             assert NOT_FINITE.search(text) is None, (file.name, NOT_FINITE.search(text))
@@ -125,6 +130,7 @@ def _refuse_not_finite(path: Path) -> None:
 
 @pytest.mark.parametrize("form", [form.name for form in FORMATS])
 def test_no_format_writes_a_number_that_is_not_finite(form: str, tmp_path: Path) -> None:
+    library(form)
     content = _content(MODEL_OF.get(form, "brown"), calibrated=form in ("bal", "sba"))  # fx and fy stay equal
     rng = np.random.default_rng(len(form))
     refused = written = 0

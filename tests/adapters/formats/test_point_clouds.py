@@ -5,7 +5,6 @@ from __future__ import annotations
 import sys
 from dataclasses import replace
 from pathlib import Path
-from types import ModuleType
 
 import numpy as np
 import pytest
@@ -15,18 +14,11 @@ from adapters.formats.registry import format_named, format_of, read_content, wri
 from sfm.model.errors import MissingLibraryError, OutputError, SurveyFileError
 from sfm.model.solution import Solution
 from tests import commands
+from tests.adapters.formats.clouds import WITHOUT, library
 from tests.places import SHARED
 from tests.synthetic import make_network, seed_of
 
-WITHOUT = "the extra kolinear[exchange] is not installed"
 FORMATS = {"laz": ("laspy", "cloud.laz"), "e57": ("pye57", "cloud.e57")}
-
-
-def library(form: str) -> ModuleType:
-    """Return the library of a format; skip where its extra is not installed."""
-    if form == "laz":
-        pytest.importorskip("lazrs", reason=WITHOUT)
-    return pytest.importorskip(FORMATS[form][0], reason=WITHOUT)  # type: ignore[no-any-return]
 
 
 def cloud(name: str, *, sigma: bool = True, far: float = 0.0) -> Content:
@@ -52,6 +44,7 @@ def written(content: Content, form: str, tmp_path: Path) -> Path:
 def test_points_are_read_back_to_a_micrometre(form: str, far: float, tmp_path: Path) -> None:
     """Also by the library of the format, and with coordinates of a national grid."""
     lib = library(form)
+    assert lib is not None
     content = cloud(f"cloud {form}", far=far)
     path = written(content, form, tmp_path)
     known = content.result.estimate.determined
@@ -144,7 +137,8 @@ def test_points_without_coordinates_are_no_cloud(tmp_path: Path) -> None:
 def test_a_cloud_is_converted_and_audited_by_commands(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    library("laz"), library("e57")
+    for form in FORMATS:
+        library(form)
     path = written(cloud("command"), "laz", tmp_path)
     assert commands.kolinear("convert", path, tmp_path / "again.e57") == 0
     assert "294 points as e57" in capsys.readouterr().out
@@ -156,6 +150,7 @@ def test_a_cloud_is_converted_and_audited_by_commands(
 @pytest.mark.skipif(not (SHARED / "data" / "formats" / "simple.laz").is_file(), reason="needs ../shared")
 def test_a_file_of_another_program_is_read() -> None:
     lib = library("laz")
+    assert lib is not None
     path = SHARED / "data" / "formats" / "simple.laz"
     theirs = lib.read(path)
     points = read_content(path).result.estimate.points

@@ -26,6 +26,7 @@ from sfm.model.errors import OutputError, SurveyFileError
 from sfm.model.estimate import Estimate
 from sfm.model.network import Network
 from sfm.model.solution import Solution
+from tests.adapters.formats.clouds import LIBRARIES, library
 from tests.rigs import make_rig
 from tests.synthetic import make_network, seed_of
 
@@ -194,6 +195,7 @@ MODEL_OF = {"bundler": "radial", "nvm": "brown", "openmvg": "brown_forward"}
 
 @pytest.mark.parametrize("name", [form.name for form in FORMATS])
 def test_a_full_disk_leaves_nothing_and_says_why(name: str, tmp_path: Path) -> None:
+    library(name)
     model = "brown" if name in ("photomodeler", "bundle-csharp", "bundle-matlab") else "opencv"
     network, truth = make_network(seed_of("full"), images=6, points=300, model=model, visibility=1.0)
     camera = truth.cameras[0]
@@ -210,7 +212,7 @@ def test_a_full_disk_leaves_nothing_and_says_why(name: str, tmp_path: Path) -> N
     if name in ("bundler", "nvm", "openmvg"):
         estimate = convert_cameras(estimate, (MODEL_OF[name],))[0]
     with (
-        full_disk(256 if name in ("rig", "nerfstudio") else 8192),
+        full_disk(256 if name in ("rig", "nerfstudio", *LIBRARIES) else 8192),
         pytest.raises(OutputError, match=r"out.*: .*cannot be written: File too large$"),
     ):
         write_any(tmp_path / "out", name, network, estimate)
