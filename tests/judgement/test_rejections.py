@@ -74,6 +74,25 @@ def test_an_image_point_is_another_one_within_the_error_of_a_prediction(clean: A
     assert rejections._other_points(a) == dict.fromkeys(rows[:2], 9)
 
 
+@pytest.mark.parametrize("model", ["brown", "opencv", "opencv_fisheye"])
+def test_a_point_is_found_wherever_in_the_photograph_and_around_it(model: str) -> None:
+    """Up to the tolerance in every direction, also at the corners, where lenses distort most."""
+    network, truth = make_network(seed_of(model), images=6, points=80, free=(), model=model)
+    a = adjust(network, truth, datum=Datum("free"), reject="none")
+    seen = a.network.image_points
+    tolerance = np.sqrt(2 * chi2_isf(0.01, 2)) * a.sigma0_px
+    first = np.flatnonzero(seen.image == 0)
+    for k, angle in enumerate(np.linspace(0, 2 * np.pi, 24, endpoint=False)):
+        row, other = first[k % len(first)], seen.point[first[(k + 7) % len(first)]]
+        xy = at(a, row, a.estimate.points[other])
+        direction = np.array([np.cos(angle), np.sin(angle)])
+        near, far = (
+            rejections._other_points(with_rejected(a, {row: xy + factor * tolerance * direction}))
+            for factor in (0.99, 1.01)
+        )
+        assert near == {row: other} and far != near
+
+
 def test_a_point_is_not_taken_for_itself(clean: Adjustment) -> None:
     row = row_of(clean, 3, 1)
     a = with_rejected(clean, {row: at(clean, row, clean.estimate.points[3])})

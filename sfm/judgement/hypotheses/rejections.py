@@ -13,8 +13,8 @@ import numpy as np
 
 from sfm.adjustment.quality.consistency import intersect_rays
 from sfm.adjustment.result import Adjustment
-from sfm.model.camera import project
-from sfm.model.conventions import IntArray
+from sfm.model.camera import Camera, project, rays_from_pixel
+from sfm.model.conventions import BoolArray, FloatArray, IntArray
 from sfm.model.distributions import chi2_isf, chi2_sf
 from sfm.model.network import rows_of
 from sfm.model.remarks.remark import Remark, remark
@@ -23,6 +23,7 @@ MIN_EXCHANGED = 2  # photographs with two names exchanged from which this is sys
 MIN_RAYS = 3  # rays that meet at a second position; two nearly meet anywhere along an epipolar line
 # Largest ratio of the variance of a prediction plus its measurement to that of the measurement.
 MAX_PREDICTION_RATIO = 2.0
+MAX_WIDENING = 2.0  # of the angle to pixels around one, in other directions than along rows and columns
 
 
 @dataclass(frozen=True)
@@ -73,14 +74,38 @@ def _other_points(a: Adjustment) -> dict[int, int]:
         if not len(rows):
             continue
         camera = estimate.cameras[network.camera[i]]
-        at = project(camera, estimate.position[i], estimate.rotation[i], estimate.points)
+        outward = (estimate.points - estimate.position[i]) @ estimate.rotation[i]
+        outward /= np.linalg.norm(outward, axis=1, keepdims=True)
         for row in rejected[rows].tolist():
+            near = np.flatnonzero(_may_be_within(camera, seen.xy[row], tolerance, outward))
+            near = near[near != seen.point[row]]
+            at = project(camera, estimate.position[i], estimate.rotation[i], estimate.points[near])
             away = np.linalg.norm(at - seen.xy[row], axis=1)
-            away[seen.point[row]] = np.inf
             q = int(np.nanargmin(away)) if np.isfinite(away).any() else -1
             if q >= 0 and away[q] < tolerance:
-                nearest[row] = q
+                nearest[row] = int(near[q])
     return nearest
+
+
+def _may_be_within(camera: Camera, xy: FloatArray, tolerance: float, outward: FloatArray) -> BoolArray:
+    """Return which directions may be seen within a distance of a pixel, (n,).
+
+    They are within the angle to the pixels around it, which lenses change little over a few pixels. A model
+    of thousands of points has a few of them at a pixel, and projecting all takes longer than its adjustment.
+
+    Args:
+        camera: interior orientation.
+        xy: the pixel, px, (2,).
+        tolerance: the distance, px.
+        outward: unit vectors in the image frame, (n, 3).
+    """
+    around = np.concatenate([np.zeros((1, 2)), *(tolerance * np.array([np.eye(2), -np.eye(2)]))])
+    rays = rays_from_pixel(camera, xy + around)
+    rays /= np.linalg.norm(rays, axis=1, keepdims=True)
+    chord = MAX_WIDENING * np.linalg.norm(rays[1:] - rays[0], axis=1).max()
+    if not np.isfinite(chord):
+        return np.ones(len(outward), dtype=bool)
+    return np.asarray(np.linalg.norm(outward - rays[0], axis=1) <= chord)
 
 
 def _key(a: Adjustment, row: int, q: int) -> tuple[int, int]:
