@@ -329,17 +329,16 @@ def _camera_normals(
 ) -> tuple[FloatArray, FloatArray]:
     """Return A'A (a, a) and A'v (a,) of photographs and cameras."""
     S, t = np.zeros((size, size)), np.zeros(size)
-    At = np.swapaxes(A, 1, 2)
-    N, b = At @ A, np.einsum("kab,kb->ka", At, v)
     for i, rows in enumerate(rows_of(image, m)):
         pose = slice(6 * i, 6 * i + 6)
-        of_photograph = N[rows].sum(axis=0)
-        S[pose, pose] = of_photograph[:6, :6]
-        S[pose, 6 * m :] = of_photograph[:6, 6:]
-        S[6 * m :, pose] = of_photograph[6:, :6]
-        S[6 * m :, 6 * m :] += of_photograph[6:, 6:]
-        t[pose] = b[rows].sum(axis=0)[:6]
-        t[6 * m :] += b[rows].sum(axis=0)[6:]
+        of_photograph = A[rows].reshape(2 * len(rows), A.shape[2])
+        N, b = of_photograph.T @ of_photograph, of_photograph.T @ v[rows].ravel()
+        S[pose, pose] = N[:6, :6]
+        S[pose, 6 * m :] = N[:6, 6:]
+        S[6 * m :, pose] = N[6:, :6]
+        S[6 * m :, 6 * m :] += N[6:, 6:]
+        t[pose] = b[:6]
+        t[6 * m :] += b[6:]
     return S, t
 
 
