@@ -9,7 +9,7 @@ Source: `sfm.judgement.model_choice`; Kass and Raftery (1995), J. Am. Stat. Asso
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -71,7 +71,14 @@ def compare_models(adjustment: Adjustment, camera: int = 0) -> tuple[Alternative
         return ()
     network = adjustment.network
     owner = network.camera[network.image_points.image[~adjustment.rejected]]
-    others = list(_alternatives(present))
+    others: list[tuple[bool, BoolArray]] = []  # whether parameters are added, and which are added or left out
+    for group, roles in GROUPS.items():
+        mine = np.flatnonzero(present.plays(*roles))
+        free, held = mine[present.free[mine]], mine[~present.free[mine]]
+        last = slice(-1, None) if group == "radial" else slice(None)
+        for added, chosen in ((False, free[last]), (True, held[:1] if group == "radial" else held)):
+            if len(chosen):
+                others.append((added, np.isin(np.arange(len(present.names)), chosen)))
     search = float(np.log(max(len(others), 1) / adjustment.levels.family))
     none = np.zeros_like(present.free)
     own = _squares(adjustment, camera, none)
@@ -88,17 +95,6 @@ def compare_models(adjustment: Adjustment, camera: int = 0) -> tuple[Alternative
         price = price_of(len(names), seen, search if added else 0.0)
         compared.append(Alternative(present.name, added, names, gain, price))
     return tuple(compared)
-
-
-def _alternatives(camera: Camera) -> Iterator[tuple[bool, BoolArray]]:
-    """Yield whether parameters are added, and which ones are added or left out, (n,)."""
-    for group, roles in GROUPS.items():
-        mine = np.flatnonzero(camera.plays(*roles))
-        free, held = mine[camera.free[mine]], mine[~camera.free[mine]]
-        last = slice(-1, None) if group == "radial" else slice(None)
-        for added, chosen in ((False, free[last]), (True, held[:1] if group == "radial" else held)):
-            if len(chosen):
-                yield added, np.isin(np.arange(len(camera.names)), chosen)
 
 
 def _squares(adjustment: Adjustment, camera: int, changed: BoolArray) -> tuple[float, int] | None:

@@ -24,7 +24,6 @@ from sfm.products.calibration.calibration import (
 )
 from sfm.products.calibration.crossvalidation import HalvesDifference
 from sfm.products.calibration.poses import NextPoses, Pose
-from sfm.products.calibration.splined import SplinedCalibration
 from sfm.report.figures.comparisons import difference_figure
 from sfm.report.figures.plot_data import Plot
 from sfm.report.figures.plots import (
@@ -98,22 +97,21 @@ def page(calibration: Calibration, *, folder: str = "RESULT") -> Page:
 
 def verdict_of(calibration: Calibration) -> Verdict:
     """Return the verdict on a calibration."""
-    found = ". ".join(_statement(calibration, camera) for camera in calibration.cameras)
+    statements = []
+    for camera in calibration.cameras:
+        middle, corner = _sigmas(camera, np.inf)
+        halves = calibration.validation.clearest(camera.name)
+        stated = f"Camera {camera.name} is not determined"
+        if np.isfinite(corner):
+            stated = (
+                f"Camera {camera.name} is known to {significant(middle)} px in the middle and "
+                f"{significant(corner)} px in the worst corner (1 sigma, far points)"
+            )
+            if halves is not None and halves.probability < calibration.level:
+                stated += f", but halves of its photographs differ by {significant(halves.rms_px)} px"
+        statements.append(stated)
+    found = ". ".join(statements)
     return judge(calibration.remarks, {level: text.format(found=found) for level, text in HEADLINES.items()})
-
-
-def _statement(calibration: Calibration, camera: CameraCalibration) -> str:
-    middle, corner = _sigmas(camera, np.inf)
-    if not np.isfinite(corner):
-        return f"Camera {camera.name} is not determined"
-    known = (
-        f"Camera {camera.name} is known to {significant(middle)} px in the middle and "
-        f"{significant(corner)} px in the worst corner (1 sigma, far points)"
-    )
-    halves = calibration.validation.clearest(camera.name)
-    if halves is None or not halves.probability < calibration.level:
-        return known
-    return f"{known}, but halves of its photographs differ by {significant(halves.rms_px)} px"
 
 
 def _sigmas(camera: CameraCalibration, distance: float) -> tuple[float, float]:
@@ -169,7 +167,14 @@ def _trust(calibration: Calibration) -> Iterator[Part]:
             ("image points", f"sigma0 {a.sigma0_px:.3f} px, RMS residual {a.rms_px:.3f} px"),
         ]
         for distance in reversed(calibration.distances):
-            rows.append((f"projection at {_at(distance, unit)}", _projection(camera, distance)))
+            middle, corner = _sigmas(camera, distance)
+            stated = "not determined"
+            if np.isfinite(corner):
+                stated = (
+                    f"1 sigma {significant(middle)} px in the middle, {significant(corner)} px in the worst "
+                    f"corner; known in {100 * _share(camera, distance):.0f} % of the format"
+                )
+            rows.append((f"projection at {_at(distance, unit)}", stated))
         halves = calibration.validation.clearest(camera.name)
         if halves is not None:
             rows.append(
@@ -187,16 +192,6 @@ def _trust(calibration: Calibration) -> Iterator[Part]:
         "predicts it, one standard deviation per coordinate. The point is fixed to the object through each "
         "photograph, so that what poses absorb does not count. It is true as far as the model fits; see what "
         f"is wrong. Known: between image points, with a sigma of at most {KNOWN_FACTOR:g} times the best."
-    )
-
-
-def _projection(camera: CameraCalibration, distance: float) -> str:
-    middle, corner = _sigmas(camera, distance)
-    if not np.isfinite(corner):
-        return "not determined"
-    return (
-        f"1 sigma {significant(middle)} px in the middle, {significant(corner)} px in the worst corner; "
-        f"known in {100 * _share(camera, distance):.0f} % of the format"
     )
 
 
@@ -360,7 +355,14 @@ def _model_parts(camera: CameraCalibration, level: float, folder: str) -> Iterat
     else:
         words.append("Its residuals are not tested: no part of the format has points of enough photographs.")
     if camera.splined is not None:
-        words.append(_splined_words(camera.splined, camera, folder))
+        splined = camera.splined
+        words.append(
+            f"A splined camera describes the lens better: its surface departs from {camera.camera.model} by "
+            f"{significant(splined.sigma_px)} px, image points determine {splined.determined:.0f} of its "
+            f"{int(splined.camera.free.sum())} coefficients, and sigma0 falls to "
+            f"{significant(splined.adjustment.sigma0_px)} px. Use it with --camera "
+            f"{shlex.quote(f'{folder}/{splined_folder(camera)}')}."
+        )
     if camera.missing:
         words.append(f"The photographs demand {listed(camera.missing)}: add to free in the survey file.")
     if needless:
@@ -368,17 +370,6 @@ def _model_parts(camera: CameraCalibration, level: float, folder: str) -> Iterat
     trusted = not (insufficient or camera.missing) and np.isfinite(field.whole)
     yield Statement(" ".join(words), "good" if trusted else "fair")
     yield Table(heads, rows)
-
-
-def _splined_words(splined: SplinedCalibration, camera: CameraCalibration, folder: str) -> str:
-    """Return what a splined camera describes, and how it is used."""
-    return (
-        f"A splined camera describes the lens better: its surface departs from {camera.camera.model} by "
-        f"{significant(splined.sigma_px)} px, image points determine {splined.determined:.0f} of its "
-        f"{int(splined.camera.free.sum())} coefficients, and sigma0 falls to "
-        f"{significant(splined.adjustment.sigma0_px)} px. Use it with --camera "
-        f"{shlex.quote(f'{folder}/{splined_folder(camera)}')}."
-    )
 
 
 def splined_folder(camera: CameraCalibration) -> str:

@@ -151,17 +151,13 @@ def splined_like(camera: Camera, seen: FloatArray) -> Camera:
     # residuals are linear in the coefficients; where the format has no rays, the surface is straight
     A = parameter_jacobian(straight, rays)[:, :, free].reshape(-1, int(free.sum()))
     rest = (xy - pixel_from_rays(straight, rays)).ravel()
-    smooth = STRAIGHT * values[0] * np.kron(np.eye(2), _second_differences())
+    # the second differences of a surface along both axes of its grid
+    D, eye = np.diff(np.eye(KNOTS), n=2, axis=0), np.eye(KNOTS)
+    smooth = STRAIGHT * values[0] * np.kron(np.eye(2), np.vstack([np.kron(eye, D), np.kron(D, eye)]))
     p[free] = np.linalg.lstsq(
         np.vstack([A, smooth]), np.concatenate([rest, np.zeros(len(smooth))]), rcond=None
     )[0]
     return straight.with_parameters(p)
-
-
-def _second_differences() -> FloatArray:
-    """Return the second differences of a surface along both axes of its grid, (n, KNOTS^2)."""
-    D, eye = np.diff(np.eye(KNOTS), n=2, axis=0), np.eye(KNOTS)
-    return np.vstack([np.kron(eye, D), np.kron(D, eye)])
 
 
 def _correlation() -> FloatArray:

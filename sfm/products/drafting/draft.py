@@ -295,7 +295,12 @@ def _text(content: _Content, *, models: bool = True) -> str:
         f"unit = {_quoted(UNIT)}  # of the object coordinates; write the one of your scale bars",
     ]
     if content.stated is not None:
-        lines.append(_photographs_line(content.stated))
+        if is_name(content.stated):
+            lines.append(
+                f"photographs = {_quoted(content.stated)}  # their folder, from the folder of this file"
+            )
+        else:  # no key can state it
+            lines.append(f"# the photographs are in {as_plain(content.stated)}, which only --images can name")
     if content.masked:
         commented = "# " if content.unused else ""
         lines.append(f"{commented}masks = {_quoted(content.masked)}  # what is black there is ignored")
@@ -338,13 +343,6 @@ def _text(content: _Content, *, models: bool = True) -> str:
         'backend = "colmap"  # adjust with COLMAP too and compare; "none" saves the time',
     ]
     return "\n".join(lines) + "\n"
-
-
-def _photographs_line(stated: str) -> str:
-    """Return the line on the folder of the photographs, a comment if no key can state it."""
-    if is_name(stated):
-        return f"photographs = {_quoted(stated)}  # their folder, from the folder of this file"
-    return f"# the photographs are in {as_plain(stated)}, which only --images can name"
 
 
 def _camera_lines(camera: CameraGroup, free: Sequence[str], *, models: bool) -> list[str]:
@@ -545,7 +543,16 @@ def _remarks(content: _Content) -> tuple[Remark, ...]:
     assumed = [camera.name for camera in grouping.cameras if camera.assumed]
     if assumed:
         remarks.append(remark("camera_assumed", cameras=assumed))
-    remarks += _remarks_on_several(grouping.cameras)
+    # cameras of one size, or of one body, may be one
+    of_size = Counter(camera.size_px for camera in grouping.cameras)
+    of_body = Counter(camera.body for camera in grouping.cameras)
+    alike = [
+        f"{camera.name} ({len(camera.photographs)} of {camera.size_px[0]} x {camera.size_px[1]} px)"
+        for camera in grouping.cameras
+        if max(of_size[camera.size_px], of_body[camera.body]) > 1
+    ]
+    if alike:
+        remarks.append(remark("several_cameras", cameras=alike))
     if trial.plate is not None and content.pitch is None:
         remarks.append(remark("plate_pitch_assumed", pitch=(PITCH, UNIT)))
     if np.isfinite(trial.blur_px):
@@ -560,18 +567,6 @@ def _remarks(content: _Content) -> tuple[Remark, ...]:
         circles = round(trial.circles)
         remarks.append(remark("circles_without_codes", circles=circles, rows=rows, columns=columns))
     return tuple(remarks)
-
-
-def _remarks_on_several(cameras: Sequence[CameraGroup]) -> list[Remark]:
-    """Return a remark on cameras that may be one: those of one size, or of one body."""
-    of_size = Counter(camera.size_px for camera in cameras)
-    of_body = Counter(camera.body for camera in cameras)
-    alike = [camera for camera in cameras if max(of_size[camera.size_px], of_body[camera.body]) > 1]
-    each = [
-        f"{camera.name} ({len(camera.photographs)} of {camera.size_px[0]} x {camera.size_px[1]} px)"
-        for camera in alike
-    ]
-    return [remark("several_cameras", cameras=each)] if each else []
 
 
 def _quoted(text: str) -> str:

@@ -78,7 +78,13 @@ def take_frames(
     videos = videos_of(source)
     if missing_av():
         raise PhotographError(f"{videos[0]}: {conversion_of(videos[0])}")
-    before, now = _read_list(folder), _state(source, folder, count)
+    before = _read_list(folder)
+    state = [(path.name, path.stat().st_size, path.stat().st_mtime_ns) for path in videos]
+    now = {
+        "source": os.path.relpath(source.resolve(), folder.resolve()),
+        "videos": [{"name": name, "bytes": size, "modified_ns": at} for name, size, at in state],
+        "count": count,
+    }
     same = before.get("source") == now["source"] and before.get("videos") == now["videos"]
     if same and count in (None, before.get("count")):
         tell(f"Frames: {folder}, which exists; remove it to take others")
@@ -101,16 +107,6 @@ def count_of(folder: Path) -> int | None:
     """Return the number of frames that was asked for when a folder was written."""
     count = _read_list(folder).get("count")
     return count if isinstance(count, int) else None
-
-
-def _state(source: Path, folder: Path, count: int | None) -> dict[str, Any]:
-    """Return what the list of a folder states."""
-    state = [(path.name, path.stat().st_size, path.stat().st_mtime_ns) for path in videos_of(source)]
-    return {
-        "source": os.path.relpath(source.resolve(), folder.resolve()),
-        "videos": [{"name": name, "bytes": size, "modified_ns": at} for name, size, at in state],
-        "count": count,
-    }
 
 
 def _read_list(folder: Path) -> dict[str, Any]:

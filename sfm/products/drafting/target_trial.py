@@ -151,7 +151,10 @@ def try_targets(
             circles = float(np.median([look.circles for look in looks]))
             return TargetTrial("none", "auto", (), (), circles, np.nan, seen.names, unreadable=unreadable)
         seen.tags, _ = _shared_family([look.tags for look in looks])
-    _try_rings(seen)
+    readers = list(map(_ring_reader, seen.photographs, seen.plain))
+    seen.counts = _repeated_rings(readers, RINGS)
+    if all(len(codes) < TARGETS.fewest for codes in seen.counts.values()):
+        seen.counts |= _repeated_rings(readers, NECKLACES)  # no parity: they also read rings of others
     progress.advance("rings")
     if not seen.is_coded:
         refused = {name for name, _ in unreadable}
@@ -210,13 +213,6 @@ class _Seen:
         return [self.files.measure(path, family) for path in self.paths]
 
 
-def _try_rings(seen: _Seen) -> None:
-    readers = list(map(_ring_reader, seen.photographs, seen.plain))
-    seen.counts = _repeated_rings(readers, RINGS)
-    if all(len(codes) < TARGETS.fewest for codes in seen.counts.values()):
-        seen.counts |= _repeated_rings(readers, NECKLACES)  # no parity: they also read rings of others
-
-
 def _try_tags_and_boards(seen: _Seen, more: Sequence[Path], progress: Progress) -> None:
     tags, seen.plates = _tags_and_boards(seen.greys, more, seen.files, progress)
     if tags and not seen.plates:
@@ -231,7 +227,15 @@ def _try_dots(seen: _Seen, others: Sequence[Path]) -> None:
     seen.ringed = tuple(map(ringed_dots, seen.names, seen.greys.values(), seen.plain))
     if any(dots.are_most for dots in seen.ringed):
         return
-    plate = _dot_plate(seen.plain, others, seen.files)
+
+    def circles(targets: Targets) -> tuple[FloatArray, FloatArray, IntArray]:
+        circle = targets.is_circle
+        return targets.xy[circle], np.sqrt(targets.semi_axes[circle].prod(axis=1)), targets.polarity[circle]
+
+    shown = [circles(targets) for targets in seen.plain]
+    if any(shows_a_lattice(xy) for xy, _, _ in shown):
+        shown += [circles(seen.files.measure(path, "none")) for path in others]
+    plate = search_dots(shown)
     if plate is None:
         return
     pictures = zip(seen.greys.values(), seen.plain, strict=True)
@@ -404,19 +408,6 @@ def _shared_family(read: Sequence[Tags]) -> tuple[str, str]:
     if not len(repeated[largest]):
         return "", ""
     return smallest_dictionary(largest, repeated[largest]), largest
-
-
-def _dot_plate(plain: Sequence[Targets], others: Sequence[Path], files: _Files) -> PlateFamily | None:
-    """Return the plate of dots that photographs show; `others` are measured if one has a lattice."""
-
-    def circles(targets: Targets) -> tuple[FloatArray, FloatArray, IntArray]:
-        circle = targets.is_circle
-        return targets.xy[circle], np.sqrt(targets.semi_axes[circle].prod(axis=1)), targets.polarity[circle]
-
-    seen = [circles(targets) for targets in plain]
-    if any(shows_a_lattice(xy) for xy, _, _ in seen):
-        seen += [circles(files.measure(path, "none")) for path in others]
-    return search_dots(seen)
 
 
 def _as_bytes(photograph: AnyArray) -> AnyArray:

@@ -252,12 +252,6 @@ def _sharpness(grey: AnyArray) -> float:
     return power(grey) / max(power(np.asarray(coarse)), 1e-6)
 
 
-def _name_of(video: Path, others: Sequence[Path]) -> str:
-    """Return the name of a video among others: without its ending, if that is enough."""
-    alike = [other for other in others if other.stem.casefold() == video.stem.casefold()]
-    return as_plain(video.stem if len(alike) < 2 else video.name.replace(".", "-"))
-
-
 @dataclass(frozen=True)
 class WrittenFrames:
     """The frames that were taken of a video."""
@@ -290,7 +284,9 @@ def extract_frames(
             way = follow_camera(video, progress)
             chosen = choose_frames(way, count)
             said = list(video.remarks())
-            names = write_frames(video, chosen, folder, _name_of(path, videos))
+            alike = [other for other in videos if other.stem.casefold() == path.stem.casefold()]
+            name = as_plain(path.stem if len(alike) < 2 else path.name.replace(".", "-"))
+            names = write_frames(video, chosen, folder, name)
         if len(names) == 1 < len(way.times_s):
             why = "the camera does not move" if way.followed else "its pictures show nothing to follow"
             said.append(f"{why}: one frame is taken; film the object from several places, in good light")

@@ -14,6 +14,7 @@ Kuhlmann (2000), Auswertung geodaetischer Ueberwachungsmessungen, sec. 6.
 from __future__ import annotations
 
 from collections.abc import Iterator, Mapping, Sequence
+from contextlib import suppress
 from dataclasses import dataclass
 from itertools import pairwise
 
@@ -175,13 +176,17 @@ def analyse_epochs(
         differences = epoch_differences(first, second)
         chosen = _reference(differences, reference, (first, second)) if reference else None
         moved = find_displacements(differences, reference=chosen, alpha=alpha)
+        common = None  # the motion of all points that moved, as one block
+        if moved.moved.sum() > MIN_POINTS["rigid"]:
+            with suppress(GeometryError):  # points on a line do not determine their rotation about it
+                common = block_motion(moved, moved.moved, name=MOVED)
         return EpochPair(
             moved,
             tuple(
                 block_motion(moved, _group(differences, name, patterns), name=name, model=model)
                 for name, patterns in (groups or {}).items()
             ),
-            _common_motion(moved),
+            common,
             mount_changes(first.result, second.result, alpha=alpha, redundancy=differences.redundancy),
         )
 
@@ -228,16 +233,6 @@ def _group(differences: Differences, name: str, patterns: Sequence[str]) -> Bool
 
 def _matching(names: tuple[str, ...], pattern: str) -> BoolArray:
     return np.array([matches(name, pattern) for name in names], dtype=bool)
-
-
-def _common_motion(displacements: Displacements) -> BlockMotion | None:
-    """Return the motion of all points that moved as one block; None if it is not determined or checked."""
-    if displacements.moved.sum() <= MIN_POINTS["rigid"]:
-        return None
-    try:
-        return block_motion(displacements, displacements.moved, name=MOVED)
-    except GeometryError:  # points on a line do not determine their rotation about it
-        return None
 
 
 def verdict_of_epochs(series: EpochSeries) -> Verdict:

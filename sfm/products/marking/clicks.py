@@ -360,9 +360,17 @@ def _window(photograph: AnyArray, asked: _Asked) -> Measured | None:
         xy, C = points.xy[near[0]], points.covariance[near[0]]
     else:
         note = f"no distinct place within {within:.0f} px: the place itself is the point"
-        C = _window_covariance(part, xy, half)
-        if C is None:
+        column, row = (round(float(v)) for v in xy)
+        window = part.grey[max(row - half, 0) : row + half + 1, max(column - half, 0) : column + half + 1]
+        if min(window.shape) < half + 1:
             return None
+        # the covariance with which least squares matching finds a window
+        gy, gx = np.gradient(window.astype(float))
+        N = np.array([[(gx * gx).sum(), (gx * gy).sum()], [(gx * gy).sum(), (gy * gy).sum()]])
+        N -= part.noise**2 / 2 * window.size * np.eye(2)  # of the differences
+        if not (np.linalg.eigvalsh(N)[0] > part.noise**2 * window.size / 2):
+            return None
+        C = np.asarray(part.noise**2 * np.linalg.inv(N))
     box = half * np.array([[-1, -1], [1, -1], [1, 1], [-1, 1], [-1, -1]])
     return Measured(float(xy[0]), float(xy[1]), C, "window", xy + box, note=note).moved(part.origin)
 
@@ -387,20 +395,6 @@ def _matched(
     return Measured(float(xy[0]), float(xy[1]), match.covariance[0] / 2, "window", xy + turned).moved(
         right.origin
     )
-
-
-def _window_covariance(part: _Part, xy: FloatArray, half: int) -> FloatArray | None:
-    """Return the covariance with which least squares matching finds a window, px^2; None without texture."""
-    column, row = (round(float(v)) for v in xy)
-    window = part.grey[max(row - half, 0) : row + half + 1, max(column - half, 0) : column + half + 1]
-    if min(window.shape) < half + 1:
-        return None
-    gy, gx = np.gradient(window.astype(float))
-    N = np.array([[(gx * gx).sum(), (gx * gy).sum()], [(gx * gy).sum(), (gy * gy).sum()]])
-    N -= part.noise**2 / 2 * window.size * np.eye(2)  # of the differences
-    if not (np.linalg.eigvalsh(N)[0] > part.noise**2 * window.size / 2):
-        return None
-    return np.asarray(part.noise**2 * np.linalg.inv(N))
 
 
 METHODS: dict[Kind, Callable[..., Measured | None]] = {

@@ -497,7 +497,15 @@ def sentence_of(following: Following, proposals: Mapping[tuple[str, str], Propos
     for i in orientation.open:
         return f"{names[i]} has several orientations that fit its marks: mark one more point."
     if not estimate.oriented.any() and len(network.control.complete) < MIN_KNOWN:
-        return _pair_sentence(following)
+        seen = network.image_points
+        marked = np.zeros((len(names), len(network.points)), dtype=np.int64)
+        marked[seen.image, seen.point] = 1
+        common = np.triu(marked @ marked.T, 1)
+        first, second = np.unravel_index(int(np.argmax(common)), common.shape)
+        if not common[first, second]:
+            return "Mark the same point in a second photograph: five common points orient two photographs."
+        lacking = counted(max(MIN_COMMON - int(common[first, second]), 1), "more common point")
+        return f"{names[first]} and {names[second]} need {lacking} until they are oriented."
     waiting_photographs = np.flatnonzero(needed > 0)
     if len(waiting_photographs):
         i = int(
@@ -512,19 +520,6 @@ def sentence_of(following: Following, proposals: Mapping[tuple[str, str], Propos
         more_rays = 3 - int(rays[network.points.index(short[0])])
         return f"Point {short[0]} needs {counted(more_rays, 'more ray')} to be checked."
     return "All photographs are oriented: find everything else automatically."
-
-
-def _pair_sentence(following: Following) -> str:
-    network = following.marked.network
-    seen, names = network.image_points, network.images
-    marked = np.zeros((len(names), len(network.points)), dtype=np.int64)
-    marked[seen.image, seen.point] = 1
-    common = np.triu(marked @ marked.T, 1)
-    i, j = np.unravel_index(int(np.argmax(common)), common.shape)
-    if not common[i, j]:
-        return "Mark the same point in a second photograph: five common points orient two photographs."
-    more = max(MIN_COMMON - int(common[i, j]), 1)
-    return f"{names[i]} and {names[j]} need {counted(more, 'more common point')} until they are oriented."
 
 
 def without_moved(last: Following, marking: Marking, project: MarkedProject) -> Following | None:

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import threading
 from collections import Counter
-from collections.abc import Callable, Iterable, Mapping
+from collections.abc import Callable, Iterable
 from contextlib import suppress
 from dataclasses import replace
 from itertools import count
@@ -522,20 +522,16 @@ class MarkingSession:
         """Return what was measured at a mark, or is measured there again; None where that is not possible."""
         place = mark.photograph, mark.x, mark.y
         if place not in self._fits:
-            self._fits[place] = self._measured_again(mark)
+            measured = None
+            if mark.photograph in self._index and mark.kind not in ("window", "hand"):
+                kind: Kind = "target" if mark.kind == "ring" else mark.kind
+                family = self.project.survey.family
+                with suppress(GeometryError, PhotographError):
+                    pixels = self.pixels.grey(self._index[mark.photograph])
+                    fit = measure_click(pixels, mark.x, mark.y, kind, family=family)
+                    measured = fit if np.hypot(fit.x - mark.x, fit.y - mark.y) <= SAME_PX else None
+            self._fits[place] = measured
         return self._fits[place]
-
-    def _measured_again(self, mark: Mark) -> Measured | None:
-        if mark.photograph not in self._index or mark.kind in ("window", "hand"):
-            return None
-        kind: Kind = "target" if mark.kind == "ring" else mark.kind
-        family = self.project.survey.family
-        try:
-            pixels = self.pixels.grey(self._index[mark.photograph])
-            fit = measure_click(pixels, mark.x, mark.y, kind, family=family)
-        except (GeometryError, PhotographError):
-            return None
-        return fit if np.hypot(fit.x - mark.x, fit.y - mark.y) <= SAME_PX else None
 
     def _new_name(self, marking: Marking, photograph: str, measured: Measured) -> str:
         """Return the code of a ring, or the next free name."""
@@ -652,7 +648,9 @@ class MarkingSession:
 
     def _follow_changes(self) -> None:
         """Compute what follows from the marks whenever they changed, until the session ends."""
-        self._look_for_changed_files()
+        for name in self._saved.now.hashes.keys() & self._index.keys():  # did their files change?
+            with suppress(PhotographError, OSError):
+                self._hash(name)
         while True:
             with self._changed:
                 self._changed.wait_for(lambda: self._closed or self._followed < self._changes)
@@ -666,7 +664,11 @@ class MarkingSession:
                 read, fit = self.pixels.grey, self._fit
                 proposals = propose(following, marking, read, self.project, fit, known=known)
                 proposals |= match_single(following, latest, marking, read, self.project, fit)
-                proposals = {**_of_single_marks(known, marking), **proposals}
+                # proposals of points with one mark stay until a person decides
+                rays = Counter(point for _, point in marking.marks)
+                gone = marking.marks.keys() | marking.refused.keys()
+                stay = {key: known[key] for key in known if rays[key[1]] == 1 and key not in gone}
+                proposals = {**stay, **proposals}
                 failed = ""
             except KolinearError as error:
                 following, proposals, failed = last, {}, str(error)
@@ -701,12 +703,6 @@ class MarkingSession:
                 continue
             with suppress(Exception):  # told when it is needed
                 self.pixels.grey(i)
-
-    def _look_for_changed_files(self) -> None:
-        """Compare the photographs that have marks with their hashes in the marks file."""
-        for name in self._saved.now.hashes.keys() & self._index.keys():
-            with suppress(PhotographError, OSError):
-                self._hash(name)
 
     # --- the state ---------------------------------------------------------------------------------
 
@@ -935,12 +931,3 @@ def _told(marks: list[Mark]) -> str:
 
 def _shown_change(change: Change | None) -> dict[str, Any] | None:
     return None if change is None else vars(change)
-
-
-def _of_single_marks(
-    known: Mapping[tuple[str, str], Proposal], marking: Marking
-) -> dict[tuple[str, str], Proposal]:
-    """Return the proposals of points with one mark, which stay until a person decides."""
-    rays = Counter(point for _, point in marking.marks)
-    gone = marking.marks.keys() | marking.refused.keys()
-    return {key: proposal for key, proposal in known.items() if rays[key[1]] == 1 and key not in gone}

@@ -328,22 +328,17 @@ def figures(plan: Plan) -> list[tuple[str, str]]:
         name = contribution.name
         if name == ScaleBars.name:
             name = "scale bars and distances"  # both are bars
-        rows.append((f"gain by {name}", _gain_in_words(contribution)))
+        precise = "nothing without it"
+        if np.isfinite(contribution.gain):
+            precise = f"points {contribution.gain:.2f} times as precise"
+        if given := _given(contribution):
+            beside = contribution.shifts or contribution.rotations or contribution.scale
+            precise = f"alone gives {' and '.join(given)}; {'beside that ' if beside else ''}{precise}"
+        rows.append((f"gain by {name}", precise))
     if a.undetermined:
         more = f"; and {len(a.undetermined) - 1} more" if len(a.undetermined) > 1 else ""
         rows.append(("not determined", f"{a.undetermined[0]}{more}"))
     return rows
-
-
-def _gain_in_words(contribution: Contribution) -> str:
-    """Return in words what a kind of observation adds, as "alone gives the scale; points 1.30 times ..."."""
-    precise = "nothing without it"
-    if np.isfinite(contribution.gain):
-        precise = f"points {contribution.gain:.2f} times as precise"
-    if not _given(contribution):
-        return precise
-    beside = "beside that " if contribution.shifts or contribution.rotations or contribution.scale else ""
-    return f"alone gives {' and '.join(_given(contribution))}; {beside}{precise}"
 
 
 def _given(contribution: Contribution) -> list[str]:

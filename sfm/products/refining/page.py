@@ -7,7 +7,6 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from sfm.adjustment.result import Adjustment
 from sfm.judgement.bundle_statistics import given_of
 from sfm.judgement.checks import standard_deviations
 from sfm.model.conventions import IntArray
@@ -155,12 +154,6 @@ def _cameras(refinement: Refinement, numbers: Numbers) -> tuple[Part, ...]:
     return Table(heads, rows, "sigma_cameras"), note
 
 
-def _common_px(a: Adjustment) -> str:
-    """Return the standard deviation of the error that neighbouring image points share, px."""
-    correlation = a.error_correlation
-    return "none" if correlation is None else significant(correlation.sigmas_px(a.sigma0_px)[1])
-
-
 def _sizes(refinement: Refinement, numbers: Numbers, unit: str) -> list[tuple[object, ...]]:
     """Return the rows of the comparison: name, before, adjusted here, measured anew."""
     readjusted = refinement.readjusted
@@ -170,8 +163,16 @@ def _sizes(refinement: Refinement, numbers: Numbers, unit: str) -> list[tuple[ob
         "Rotation: median standard deviation [mdeg]",
         f"Point: median standard deviation of a coordinate [{unit}]",
     )
-    sigmas = zip(*map(_median_sigmas, adjustments), strict=True)
-    medians = [(name, "", *of_both) for name, of_both in zip(names, sigmas, strict=True)]
+    sigmas, shared = [], []
+    for adjusted in adjustments:
+        C, correlation = adjusted.covariance, adjusted.error_correlation
+        parts = (C.exterior[:, :3, :3], np.degrees(1e3) ** 2 * C.exterior[:, 3:, 3:], C.points)
+        # per coordinate, RMS of three
+        sigmas.append([significant(float(np.median(np.sqrt(np.einsum("nii->n", Q) / 3)))) for Q in parts])
+        shared.append(
+            "none" if correlation is None else significant(correlation.sigmas_px(adjusted.sigma0_px)[1])
+        )
+    medians = [(name, "", *each) for name, *each in zip(names, *sigmas, strict=True)]
     rms = [
         general(px, 4)
         for px in (refinement.before_px, *(adjusted.rms_px for adjusted in adjustments), numbers.written_px)
@@ -179,7 +180,7 @@ def _sizes(refinement: Refinement, numbers: Numbers, unit: str) -> list[tuple[ob
     rows: list[tuple[object, ...]] = [
         ("RMS of key points, per coordinate [px]", *rms[:3]),
         ("sigma0 [px]", "", *(general(adjusted.sigma0_px, 4) for adjusted in adjustments)),
-        ("Errors that neighbours share [px]", "", *map(_common_px, adjustments)),
+        ("Errors that neighbours share [px]", "", *shared),
         *medians,
         ("Photographs", len(refinement.images), *(len(adjusted.network.images) for adjusted in adjustments)),
         ("Points", len(refinement.points), len(readjusted.network.points), refinement.points_anew.sum()),
@@ -190,13 +191,6 @@ def _sizes(refinement: Refinement, numbers: Numbers, unit: str) -> list[tuple[ob
         ("RMS of the key points in the files, per coordinate [px]", rms[0], "", rms[3]),
     ]
     return [*rows, ("Targets", "", "", len(refinement.target_points))] if refinement.targets else rows
-
-
-def _median_sigmas(adjustment: Adjustment) -> list[str]:
-    """Return median standard deviations per coordinate (RMS of three) of centres, rotations and points."""
-    C = adjustment.covariance
-    parts = (C.exterior[:, :3, :3], np.degrees(1e3) ** 2 * C.exterior[:, 3:, 3:], C.points)
-    return [significant(float(np.median(np.sqrt(np.einsum("nii->n", Q) / 3)))) for Q in parts]
 
 
 def _photographs(refinement: Refinement, numbers: Numbers, unit: str) -> tuple[Part, ...]:

@@ -196,7 +196,13 @@ def _paint_face(fine: AnyArray, scene: Scene, face: int, view: _View, n: int, sc
     shape_of_box = (box[1] - box[0], box[3] - box[2])
     value, cover = (cells[: shape_of_box[0] * shape_of_box[1]].reshape(shape_of_box) for cells in scratch)
     rectangle = np.array([*faces.half[face], 0.0, 0.0])
-    lamp = _lamp(scene, face)
+    lamp = Lamp(0.0, 0.0, 1.0, 0.0, 1.0)
+    if scene.light is not None:
+        above = scene.light.position - faces.centre[face]
+        a, b = faces.axes[face] @ above
+        height = faces.normals()[face] @ above
+        reach_of_light, ambient = float(scene.light.reach) ** 2, float(scene.light.ambient)
+        lamp = Lamp(float(a), float(b), float(height), reach_of_light, ambient)
     surface = faces.value[face], faces.texture[face], faces.grain[face]
     fill_face(value, cover, box, view.rays, H, rectangle, *surface, face, lamp, n)
     on_face = np.flatnonzero(marks.face == face)
@@ -221,16 +227,6 @@ SQUARE = np.concatenate(
         np.column_stack([np.full(8, -1.0), -_SIDE]),
     ]
 )
-
-
-def _lamp(scene: Scene, face: int) -> Lamp:
-    """Return the light over a face."""
-    if scene.light is None:
-        return Lamp(0.0, 0.0, 1.0, 0.0, 1.0)
-    away = scene.light.position - scene.faces.centre[face]
-    a, b = scene.faces.axes[face] @ away
-    height = scene.faces.normals()[face] @ away
-    return Lamp(float(a), float(b), float(height), float(scene.light.reach) ** 2, float(scene.light.ambient))
 
 
 def write_photographs(staging: Staging, folder: Path) -> None:

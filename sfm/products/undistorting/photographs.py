@@ -70,7 +70,9 @@ class UndistortedPhotographs:
         if max(size) > MAX_SIDE_PX:
             raise PhotographError(f"{path.name}: {size[0]} x {size[1]} px, at most {MAX_SIDE_PX} on a side")
         refuse_bomb(path, size, data)
-        pixels = _decoded(path, data)
+        pixels = decoded_as_stored(path, data, cv2.IMREAD_UNCHANGED)
+        if pixels.dtype not in (np.uint8, np.uint16):
+            raise PhotographError(f"{path.name}: found {pixels.dtype} intensities, expected 8 or 16 bit")
         if size != view.former.size_px:
             needed = f"{view.former.size_px[0]} x {view.former.size_px[1]}"
             raise PhotographError(
@@ -101,14 +103,6 @@ class UndistortedPhotographs:
                 f"{path.name}: a photograph of {drawn.dtype} cannot be written as {out.suffix}"
             )
         out.write_bytes(encoded.tobytes())
-
-
-def _decoded(path: Path, data: bytes) -> AnyArray:
-    """Return the pixels as stored, with all bits and colours, (H, W) or (H, W, 3 or 4)."""
-    image = decoded_as_stored(path, data, cv2.IMREAD_UNCHANGED)
-    if image.dtype not in (np.uint8, np.uint16):
-        raise PhotographError(f"{path.name}: found {image.dtype} intensities, expected 8 or 16 bit")
-    return np.asarray(image)
 
 
 def _exif(header: Image.Image) -> bytes:
