@@ -198,11 +198,10 @@ def _paint_face(fine: AnyArray, scene: Scene, face: int, view: _View, n: int, sc
     rectangle = np.array([*faces.half[face], 0.0, 0.0])
     lamp = Lamp(0.0, 0.0, 1.0, 0.0, 1.0)
     if scene.light is not None:
-        above = scene.light.position - faces.centre[face]
-        a, b = faces.axes[face] @ above
-        height = faces.normals()[face] @ above
-        reach_of_light, ambient = float(scene.light.reach) ** 2, float(scene.light.ambient)
-        lamp = Lamp(float(a), float(b), float(height), reach_of_light, ambient)
+        to_light = scene.light.position - faces.centre[face]
+        along, up = faces.axes[face] @ to_light, normal @ to_light
+        reach2, ambient = float(scene.light.reach) ** 2, float(scene.light.ambient)
+        lamp = Lamp(float(along[0]), float(along[1]), float(up), reach2, ambient)
     surface = faces.value[face], faces.texture[face], faces.grain[face]
     fill_face(value, cover, box, view.rays, H, rectangle, *surface, face, lamp, n)
     on_face = np.flatnonzero(marks.face == face)
