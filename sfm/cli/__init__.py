@@ -30,7 +30,15 @@ def main() -> None:
     try:
         with stopped_once():
             try:
-                _prepare()
+                share_freed_memory()  # before a second thread starts
+                # Rare collection of cycles saves a tenth of the time of a run. At exit, Python would search
+                # all objects once more for half a second, which the freeze prevents.
+                gc.set_threshold(YOUNG_OBJECTS)
+                atexit.register(gc.freeze)
+                # checked here too: another project's sfm/__init__.py may have replaced ours
+                refuse_mixed_installation()
+                ignore_current_folder()
+                load_adapters()
                 _run()
             finally:
                 if sys.stdout is not None:
@@ -48,20 +56,6 @@ def main() -> None:
 
         message, code = ending_of(error)
         _refuse(message, code=code)
-
-
-def _prepare() -> None:
-    """Refuse folders and installations that would change the code that runs, and collect cycles less often.
-
-    Rare collection of cycles saves a tenth of the time of a run. At exit, Python would search all objects
-    once more for half a second, which the freeze prevents.
-    """
-    share_freed_memory()  # before a second thread starts
-    gc.set_threshold(YOUNG_OBJECTS)
-    atexit.register(gc.freeze)
-    refuse_mixed_installation()  # checked here too: another project's sfm/__init__.py may have replaced ours
-    ignore_current_folder()
-    load_adapters()
 
 
 def _run() -> None:

@@ -47,11 +47,19 @@ def read_tasks(
     table = read_table(points_file, ("point",), (*"XYZ", "x_mm", "y_mm"), aliases=METRES, ignored=None)
     names, points, xy = table.texts[0], table.values[:, :3], table.values[:, 3:]
     values = read_interior("resect", c_mm, camera_file)
-    c, begin = values["c"], _parse_start(start)
+    begin: FloatArray | None = None
+    if start is not None:
+        try:
+            begin = np.array([float(part) for part in start.split(",")])
+        except ValueError:
+            begin = np.empty(0)
+        if len(begin) not in (3, 6) or not np.isfinite(begin).all():
+            raise SurveyFileError(f"--start '{start}': expected X,Y,Z or X,Y,Z,omega,phi,kappa (deg)")
+        begin[3:] = np.radians(begin[3:])
     opposite = values | {name: -values[name] for name in _DISTORTION if name in values}
 
     def task(values: Mapping[str, float]) -> Task:
-        return Task(names, xy, tangents_of_photo(xy, values), points, c, begin, tolerance_mm)
+        return Task(names, xy, tangents_of_photo(xy, values), points, values["c"], begin, tolerance_mm)
 
     return task(values), task(opposite)
 
@@ -101,16 +109,3 @@ def tangents_of_photo(xy_mm: FloatArray, interior: Mapping[str, float]) -> Float
         "photograph", "brown", (1, 1), (1.0, 1.0), c_mm=interior["c"], values=tuple(interior.items())
     )
     return tangents_from_pixel(camera, pixel_from_image(xy_mm, (1, 1), _UNIT_PIXEL))
-
-
-def _parse_start(text: str | None) -> FloatArray | None:
-    if text is None:
-        return None
-    try:
-        values = np.array([float(part) for part in text.split(",")])
-    except ValueError:
-        values = np.empty(0)
-    if len(values) not in (3, 6) or not np.isfinite(values).all():
-        raise SurveyFileError(f"--start '{text}': expected X,Y,Z or X,Y,Z,omega,phi,kappa (deg)")
-    values[3:] = np.radians(values[3:])
-    return values

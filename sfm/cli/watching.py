@@ -124,27 +124,22 @@ def watch(photographs: Path, run: Callable[[], None], product: WatchedSurvey) ->
 
 def arrivals(folder: Path) -> Iterator[tuple[str, ...]]:
     """Yield the names of photographs that were added to a folder or changed, once all are complete."""
+    from sfm.photographs.reading import SUFFIXES
+
     used, before = State(), State()
     while True:
-        now = _photographs_in(folder)
+        now = State()
+        for path in sorted(folder.iterdir()):
+            with suppress(FileNotFoundError):  # it may be removed meanwhile
+                if path.suffix.lower() in SUFFIXES and path.is_file():
+                    stat = path.stat()
+                    now[path] = stat.st_size, stat.st_mtime_ns
         new = tuple(path.name for path, state in now.items() if used.get(path) != state)
         if new and now == before:
             used = now
             yield new
         before = now
         time.sleep(POLL_S)
-
-
-def _photographs_in(folder: Path) -> State:
-    from sfm.photographs.reading import SUFFIXES
-
-    state = State()
-    for path in sorted(folder.iterdir()):
-        with suppress(FileNotFoundError):  # it may be removed meanwhile
-            if path.suffix.lower() in SUFFIXES and path.is_file():
-                stat = path.stat()
-                state[path] = stat.st_size, stat.st_mtime_ns
-    return state
 
 
 def _brought(new: tuple[str, ...], product: WatchedSurvey) -> Iterator[str]:

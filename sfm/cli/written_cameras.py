@@ -63,7 +63,15 @@ def write_camera_files(
     file = with_residuals(file)
     file, conversions = readjust_cameras(file, form.stored, form.forms)
     refuse_inexact(conversions, inexact=inexact)
-    lines = [*(conversion.words for conversion in conversions), *_words_on_mounts(file, form)]
+    lines = [conversion.words for conversion in conversions]
+    if (
+        file.mounts is not None and max(map(len, file.mounts.by_rig().values()), default=0) > 1
+    ):  # written whole
+        if not form.mounted(file):
+            lines.append(f"{form.name} does not store how these cameras are mounted, as {KALIBR} does")
+        elif form.name == KALIBR and file.unit not in METRES:
+            unit = file.unit or "unknown units"
+            lines.append(f"translations are in {unit}, which {form.program} takes for metres")
     always = form.several(file.only(file.cameras[0].name))  # several cameras, also where they are no pair
     if len(file.cameras) == 1 or (form.several(file) and (target.suffix or always)):
         write_cameras(target, to, file)
@@ -74,18 +82,6 @@ def write_camera_files(
         for name, lens in zip(names, file.cameras, strict=True):
             write_cameras(folder / name, to, file.only(lens.name))
     return "\n".join([*lines, f"{target}: {counted(len(names), 'camera')} as {to}: {listed(names)}"])
-
-
-def _words_on_mounts(file: CameraFile, form: CameraFormat) -> list[str]:
-    """Return what happens to the mounts of a rig that is written whole, if the user might not expect it."""
-    if file.mounts is None or max(map(len, file.mounts.by_rig().values()), default=0) < 2:
-        return []
-    if not form.mounted(file):
-        return [f"{form.name} does not store how these cameras are mounted, as {KALIBR} does"]
-    if form.name == KALIBR and file.unit not in METRES:
-        unit = file.unit or "unknown units"
-        return [f"translations are in {unit}, which {form.program} takes for metres"]
-    return []
 
 
 def with_residuals(file: CameraFile) -> CameraFile:

@@ -11,7 +11,6 @@ from collections.abc import Callable, Iterable, Iterator
 from contextlib import AbstractContextManager, nullcontext
 from functools import partial
 from pathlib import Path
-from types import ModuleType
 from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
@@ -156,10 +155,13 @@ def batch_engine(
         MissingLibraryError: `cluster` is given but Dask is not installed.
         BackendError: no scheduler answers at the address.
     """
-    dask = _dask_cluster()
-    if dask is None:
+    try:
+        from adapters import dask_cluster as dask
+    except ModuleNotFoundError as error:
+        if error.name is None or error.name.split(".")[0] not in ("dask", "distributed"):
+            raise
         if cluster is not None:
-            raise MissingLibraryError(f"--cluster {cluster}: Dask is not installed: {INSTALL_DASK}")
+            raise MissingLibraryError(f"--cluster {cluster}: Dask is not installed: {INSTALL_DASK}") from None
         send(f"Dask is not installed: surveys run one after the other in this process; {INSTALL_DASK}")
         return nullcontext(InProcess())
     engine: AbstractContextManager[Engine]
@@ -168,17 +170,6 @@ def batch_engine(
     else:
         engine = dask.local_engine(min(jobs or dask.fitting_workers(), busy()))
     return engine
-
-
-def _dask_cluster() -> ModuleType | None:
-    """Return the adapter of Dask, or None if Dask is not installed."""
-    try:
-        from adapters import dask_cluster
-    except ModuleNotFoundError as error:
-        if error.name is None or error.name.split(".")[0] not in ("dask", "distributed"):
-            raise
-        return None
-    return dask_cluster
 
 
 class InProcess:

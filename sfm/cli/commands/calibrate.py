@@ -98,7 +98,12 @@ def calibrate(
             photographs, out, None if stays else pitch, overwrite=overwrite, edit=edit
         )
         product.note_drafted(written)
-        _refuse_model(survey_file, model)
+        asked = model is not None and survey_file.is_file()
+        if asked and f'model = "{model}"' not in survey_file.read_text(encoding="utf-8"):
+            raise KolinearError(
+                f"{survey_file}: --model {model} is for drafting a survey file, but this one exists; set "
+                "model in it, or remove it"
+            )
         options = RunOptions(
             images=images,
             out=folder,
@@ -111,16 +116,6 @@ def calibrate(
         run_survey_file(survey_file, options)
 
     run_or_watch(photographs, run_once, product)
-
-
-def _refuse_model(survey_file: Path, model: str | None) -> None:
-    """Refuse a model other than that of a survey file that exists."""
-    asked = model is not None and survey_file.is_file()
-    if asked and f'model = "{model}"' not in survey_file.read_text(encoding="utf-8"):
-        raise KolinearError(
-            f"{survey_file}: --model {model} is for drafting a survey file, but this one exists; set "
-            "model in it, or remove it"
-        )
 
 
 def _for_calibration(text: str, model: str | None) -> str:
