@@ -16,7 +16,6 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import replace
 from itertools import permutations, product
-from typing import TypeVar
 
 import numpy as np
 
@@ -39,7 +38,6 @@ from sfm.model.observations.kind import PHOTOGRAPH, POINT, Kind, TableKind, inve
 from sfm.model.observations.pose import MountObservations
 from sfm.model.similarity import Similarity, fit_similarity, nearest_rotation
 
-K = TypeVar("K", bound=Kind)
 Weighted = TableKind | ScaleBars  # with one standard deviation for each value
 
 ROUGH_ROUNDS, ROUNDS = 6, 20  # Gauss-Newton steps from each attitude, and from the best attitudes
@@ -114,18 +112,17 @@ def _of_motions(network: Network, estimate: Estimate) -> list[Weighted]:
     """Return scale bars and tabulated observations whose points and photographs have start values."""
     tables = (kind for kind in network.further if isinstance(kind, TableKind))
     kinds: tuple[Weighted, ...] = (network.scale_bars, *tables)
-    return [usable for usable in (_usable(kind, estimate) for kind in kinds) if len(usable)]
-
-
-def _usable(kind: K, estimate: Estimate) -> K:
-    """Return the observations of a kind whose points and photographs have start values."""
-    on = np.ones(len(kind), dtype=bool)
-    for of, at in kind.blocks():
-        if of not in (POINT, PHOTOGRAPH):
-            on[:] = False  # of mounts and cameras, which motions do not change
-        else:
-            on &= (estimate.determined if of == POINT else estimate.oriented)[at]
-    return kind.select(on)
+    usable = []
+    for kind in kinds:
+        on = np.ones(len(kind), dtype=bool)
+        for of, at in kind.blocks():
+            if of not in (POINT, PHOTOGRAPH):
+                on[:] = False  # of mounts and cameras, which motions do not change
+            else:
+                on &= (estimate.determined if of == POINT else estimate.oriented)[at]
+        if on.any():
+            usable.append(kind.select(on))
+    return usable
 
 
 def _fitted(

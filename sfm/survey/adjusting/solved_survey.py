@@ -260,7 +260,12 @@ def _prepare(survey: Survey, matched: Correspondences, varying: frozenset[str]) 
     survey, estimate = replace(survey, cameras=cameras), chosen.estimate
     network, estimate = split_cameras(survey.cameras, network, estimate, survey.start_cameras)
     network, estimate = split_blocks(survey, network, estimate)
-    least = np.where(given_values(survey, network).oriented, GIVEN_IMAGE_POINTS, _needed(network))
+    # how many image points each photograph needs: those of a source that gives it enough
+    needed = np.full(len(network.images), max(source.fewest for source in network.sources))
+    for k, source in enumerate(network.sources):
+        count = np.bincount(network.image_points.image[network.source == k], minlength=len(needed))
+        needed = np.where(count >= source.fewest, np.minimum(needed, source.fewest), needed)
+    least = np.where(given_values(survey, network).oriented, GIVEN_IMAGE_POINTS, needed)
     of_its_own = least
     if network.moment is not None:  # the other photographs of a moment determine its pose
         shared = np.bincount(network.moment, weights=estimate.oriented)[network.moment] > 1
@@ -273,15 +278,6 @@ def _prepare(survey: Survey, matched: Correspondences, varying: frozenset[str]) 
         (*unused, *chosen.remarks),
         chosen.accepted if survey.reject == "tau" else None,
     )
-
-
-def _needed(network: Network) -> IntArray:
-    """Return how many image points each photograph needs: those of a source that gives it enough, (m,)."""
-    needed = np.full(len(network.images), max(source.fewest for source in network.sources))
-    for k, source in enumerate(network.sources):
-        count = np.bincount(network.image_points.image[network.source == k], minlength=len(needed))
-        needed = np.where(count >= source.fewest, np.minimum(needed, source.fewest), needed)
-    return needed
 
 
 def _with_c_per_photograph(settings: CameraSettings) -> CameraSettings:
@@ -350,26 +346,22 @@ def _with_confirmed_values(
         checks_scale=bool(np.isfinite(scale_sigma(others, start.estimate))),
         false_alarm=survey.adjust.false_alarm,
     )
+    reference: FreeNetwork | None = None
+    if free is not None and not free.held:  # c held at its start value gives the network a wrong shape
+        adjusted = free.adjustment
+        tables = start.task.network
+        given_any = len(tables.control) or len(tables.scale_bars) or len(tables.exterior)
+        if tables.has_common_errors and (given_any or tables.further):
+            adjusted = replace(adjusted, error_correlation=estimate_error_correlation(adjusted))
+        reference = FreeNetwork(adjusted)
     place = None if free is None else partial(_placing, start, free)
-    given = judge_given(network, _reference(start, free), settings, mounts=mounts, place=place)
+    given = judge_given(network, reference, settings, mounts=mounts, place=place)
     needed = task.needed.copy()
     if given.datum.kind == "control":
         needed[given.network.control.complete.point] = 1
     else:
         task = task.in_free_datum
     return replace(task, network=given.network, needed=needed), given
-
-
-def _reference(start: _Prepared, free: StableAdjustment | None) -> FreeNetwork | None:
-    """Return the free network that judges given values; None without one that can."""
-    # a camera that had to be held at its start value gives the network a wrong shape
-    if free is None or free.held:
-        return None
-    adjustment, network = free.adjustment, start.task.network
-    given_any = len(network.control) or len(network.scale_bars) or len(network.exterior)
-    if network.has_common_errors and (given_any or network.further):
-        adjustment = replace(adjustment, error_correlation=estimate_error_correlation(adjustment))
-    return FreeNetwork(adjustment)
 
 
 def _placing(start: _Prepared, free: StableAdjustment, part: Network) -> Similarity:

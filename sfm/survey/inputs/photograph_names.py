@@ -80,6 +80,14 @@ def name_photographs(survey: Survey, files: PhotographList) -> NamedPhotographs:
     named = with_each_table(survey, lambda table: replace(table, image=tuple(map(name_of, table.image))))
     given = given_tables(named)
     without_file = dict.fromkeys(name for table in given for name in table.image if name not in known)
+    moments: dict[str, str] = {}
+    for text, moment in survey.moments.items():
+        name = name_of(text)
+        before = moments.setdefault(name, moment)
+        if before != moment:
+            raise SurveyFileError(
+                f"{survey.source}: photograph '{name}' has the moments '{before}' and '{moment}', needed one"
+            )
     survey = replace(
         with_each_table(named, lambda table: _of_survey(table, survey, files)),
         marks=marks,
@@ -87,7 +95,7 @@ def name_photographs(survey: Survey, files: PhotographList) -> NamedPhotographs:
         marked_hashes={name_of(name): value for name, value in survey.marked_hashes.items()},
         exterior=_renamed(survey.exterior, name_of),
         start_orientations=_renamed(survey.start_orientations, name_of),
-        moments=_moments_renamed(survey, name_of),
+        moments=moments,
     )
     if not without_file:
         return NamedPhotographs(survey)
@@ -136,19 +144,6 @@ def _renamed(given: T | None, name_of: Callable[[str], str]) -> T | None:
     names = tuple(map(name_of, given.names))
     given.table.refuse_duplicates(names, ("image",))
     return replace(given, names=names)
-
-
-def _moments_renamed(survey: Survey, name_of: Callable[[str], str]) -> dict[str, str]:
-    """Return the moments of photographs by the names of their files."""
-    moments: dict[str, str] = {}
-    for text, moment in survey.moments.items():
-        name = name_of(text)
-        before = moments.setdefault(name, moment)
-        if before != moment:
-            raise SurveyFileError(
-                f"{survey.source}: photograph '{name}' has the moments '{before}' and '{moment}', needed one"
-            )
-    return moments
 
 
 def _names_by_text(files: PhotographList, folder: Path) -> Callable[[str], str]:

@@ -241,11 +241,21 @@ def _match_all(
     scenes: dict[str, tuple[TemplateScene, int] | None] = {}
     templates: defaultdict[str, list[PointSettings]] = defaultdict(list)
     named: set[str] = set()
+    images, is_oriented = scene.network.images, scene.estimate.oriented
     for mark in survey.marks:
         if mark.name in named:
             continue
         if mark.image not in scenes:
-            scenes[mark.image] = _scene_with(survey, scene, mark, files)
+            scenes[mark.image] = None  # unless it is oriented
+            if mark.image not in files.names:
+                path = path_inside(
+                    survey.folder, mark.image, survey.source, allow_outside=survey.allow_outside
+                )
+                with_earlier = _with_earlier(scene, grey_of(read_photograph(path)))
+                if with_earlier is not None:
+                    scenes[mark.image] = with_earlier, with_earlier.earlier
+            elif mark.image in images and is_oriented[images.index(mark.image)]:
+                scenes[mark.image] = scene, images.index(mark.image)
         if scenes[mark.image] is not None:
             templates[mark.image].append(mark)
             named.add(mark.name)
@@ -258,19 +268,6 @@ def _match_all(
         parts.append(replace(rays.image_points, point=point[rays.image_points.point]))
         alike.append(point[rays.alike])
     return TemplateRays(ImagePoints.joined(parts), np.concatenate(alike))
-
-
-def _scene_with(
-    survey: Survey, scene: TemplateScene, mark: PointSettings, files: PhotographList
-) -> tuple[TemplateScene, int] | None:
-    """Return the scene with the photograph of a mark, and which it is; None if it is not oriented."""
-    if mark.image not in files.names:
-        path = path_inside(survey.folder, mark.image, survey.source, allow_outside=survey.allow_outside)
-        with_earlier = _with_earlier(scene, grey_of(read_photograph(path)))
-        return None if with_earlier is None else (with_earlier, with_earlier.earlier)
-    images = scene.network.images
-    i = images.index(mark.image) if mark.image in images else -1
-    return (scene, i) if i >= 0 and scene.estimate.oriented[i] else None
 
 
 def _with_earlier(scene: TemplateScene, photograph: AnyArray) -> TemplateScene | None:

@@ -122,13 +122,9 @@ def refuse_contradictions(survey: Described) -> None:
         _of_rigs,
         _of_photographs,
         _of_datum,
-        _of_plate,
-        _of_exterior,
-        _of_control,
         _of_scale_bars,
         _of_points,
-        _of_sizes,
-        _of_codes,
+        _of_targets,
     ):
         for contradiction in of_subject(survey):
             raise SurveyFileError(f"{survey.source}: {contradiction}")
@@ -142,7 +138,7 @@ def _of_cameras(survey: Described) -> Iterator[str]:
     needs_images = reads_photographs(survey) or len(survey.cameras) > 1
     for camera in survey.cameras:
         for of_settings in (
-            _of_balanced, _of_parameters, _of_surface, _of_correlations, _of_calibration, _of_values
+            _of_balanced, _of_parameters, _of_calibration, _of_values
         ):  # fmt: skip
             for contradiction in of_settings(camera):
                 yield f"camera {camera.name}: {contradiction}"
@@ -196,28 +192,22 @@ def _of_parameters(camera: CameraSettings) -> Iterator[str]:
             yield f"parameter '{parameter}' is both {first} and {second}"
 
 
-def _of_surface(camera: CameraSettings) -> Iterator[str]:
-    """Yield what is missing of a surface of distortion, which no survey determines by itself."""
-    surface = MODELS[camera.model].names_of(Role.RANGE, Role.SURFACE)
+def _of_calibration(camera: CameraSettings) -> Iterator[str]:
+    """Yield what contradicts a calibration, and what is missing of its values without one."""
     known = {*dict(camera.fixed), *dict(camera.weighted)}
+    surface = MODELS[camera.model].names_of(Role.RANGE, Role.SURFACE)  # no survey determines it by itself
     missing = [name for name in surface if name not in known]
     if missing and camera.calibration is None:
         yield (
             f"model {camera.model} needs the values of {counted(len(surface), 'parameter')} of its surface, "
             f"{len(missing)} are missing; give the folder of a calibration with them, calibration = FOLDER"
         )
-
-
-def _of_correlations(camera: CameraSettings) -> Iterator[str]:
     weighted = dict(camera.weighted)
     for first, second, _ in camera.correlations:
         if first == second or first not in weighted or second not in weighted:
             yield f"correlation of {first} and {second}, expected two weighted parameters"
     if camera.correlations and (camera.per_photograph or camera.per_group):
         yield "correlations go with one value for all photographs, not with per_photograph"
-
-
-def _of_calibration(camera: CameraSettings) -> Iterator[str]:
     if camera.calibration is None:
         if camera.calibration_use != "fixed":
             yield "calibration_use is given, calibration is needed with it"
@@ -323,40 +313,27 @@ def _of_photographs(survey: Described) -> Iterator[str]:
 
 
 def _of_datum(survey: Described) -> Iterator[str]:
+    """Yield what contradicts in the datum and in what carries it: plate, exterior orientation, control."""
     if survey.datum.kind == "control" and survey.datum.points:
         yield "datum.points are for kind 'free' or 'minimal', in kind 'control' the control carries the datum"
-
-
-def _of_plate(survey: Described) -> Iterator[str]:
     refuse_contradicting_plates(survey.targets, survey.source)
     refuse_free_points_without_turn(survey.targets, survey.datum.kind, survey.source)
-    if (
-        plate_control(survey.targets) is not None
-        and survey.control is not None
-        and not isinstance(survey.control, KnownPoints)
-    ):
+    plate = plate_control(survey.targets)
+    given = survey.control if isinstance(survey.control, KnownPoints) else None
+    if plate is not None and survey.control is not None and given is None:
         yield "[control] is given, but the calibration plate is the control"
-
-
-def _of_exterior(survey: Described) -> Iterator[str]:
-    """Yield unless exterior orientation is observed in exactly one way."""
     table = survey.exterior.file if isinstance(survey.exterior, ExteriorSettings) else survey.exterior
     if survey.exterior is not None and (table is None) == (survey.exif_sigma_m is None):
-        given = "neither is" if table is None else "both are"
-        yield f"[exterior]: file and exif_sigma_m, {given} given, one is needed"
+        said = "neither is" if table is None else "both are"
+        yield f"[exterior]: file and exif_sigma_m, {said} given, one is needed"
     if survey.exif_sigma_m is not None and not reads_photographs(survey):
         yield "exterior.exif_sigma_m needs photographs, the survey has [observations]; give exterior.file"
-
-
-def _of_control(survey: Described) -> Iterator[str]:
-    if survey.datum.kind != "control":
+    # the marks file of a survey file may state control
+    if survey.datum.kind != "control" or getattr(survey, "marked", None) is not None:
         return
     observed = survey.exterior is not None or survey.exif_sigma_m is not None
-    if getattr(survey, "marked", None) is not None:  # of a survey file: the marks file may state control
-        return
-    if not (survey.control is not None or observed or plate_control(survey.targets) is not None):
+    if not (survey.control is not None or observed or plate is not None):
         yield "datum kind 'control' needs [control] with the file of known points, or [exterior]"
-    given = survey.control if isinstance(survey.control, KnownPoints) else None
     if given is not None and given.only_checks and not observed:
         yield (
             f"all {counted(len(given.names), 'control point')} are check points, and datum kind 'control' "
@@ -390,8 +367,8 @@ def _of_points(survey: Described) -> Iterator[str]:
             )
 
 
-def _of_sizes(survey: Described) -> Iterator[str]:
-    """Yield sizes of tags or rings that contradict the codes or each other."""
+def _of_targets(survey: Described) -> Iterator[str]:
+    """Yield sizes of tags or rings that contradict the codes or each other, and codes that are not known."""
     targets = survey.targets
     if targets.tag_size is not None and targets.codes not in (*DICTIONARIES, *TAGGED):
         yield (
@@ -415,11 +392,8 @@ def _of_sizes(survey: Described) -> Iterator[str]:
                 f"targets.tag_size {targets.tag_size:g} is more than a million times its sigma "
                 f"{targets.tag_sigma:g}; are both in {survey.unit}?"
             )
-
-
-def _of_codes(survey: Described) -> Iterator[str]:
-    if is_table(survey.targets.codes) and not Path(survey.codes).is_file():
+    if is_table(targets.codes) and not Path(survey.codes).is_file():
         yield (
-            f"targets.codes = '{survey.targets.codes}' is neither one of "
+            f"targets.codes = '{targets.codes}' is neither one of "
             f"{', '.join((*FAMILIES, *PLATES))} nor a table file in {survey.folder}"
         )
