@@ -153,32 +153,21 @@ def _checked(where: str, value: object, allowed: tuple[Any, ...]) -> object:
     for hint in allowed:
         array = next((row for row in ARRAYS if row[0] == hint), None)
         if array is not None:
-            made = _array_of(value, array[1], array[2])
-            if made is not None:
-                return made
+            _, kinds, dtype, _ = array
+            try:
+                made = np.asarray(value)
+            except (TypeError, ValueError):  # rows of unequal length, or no sequence
+                continue
+            if made.dtype.kind in kinds or (made.dtype.kind == "f" and not made.size):
+                return made if dtype is None else made.astype(dtype, copy=False)
         elif _fits(value, hint):
-            return _as_annotated(value, hint)
+            origin, inner = typing.get_origin(hint), typing.get_args(hint)
+            holds_arrays = origin in SEQUENCES and any(row[0] == inner[0] for row in ARRAYS)
+            if isinstance(value, list | tuple) and holds_arrays:
+                value = [_checked("", element, inner[:1]) for element in value]
+            return origin(value) if origin in (list, tuple) else value
     expected = " or ".join(dict.fromkeys(_type_name(hint) for hint in allowed))
     raise GeometryError(f"{where} is {_describe_value(value)}, expected {expected}")
-
-
-def _array_of(value: object, kinds: str, dtype: Any) -> AnyArray | None:
-    """Return a value as an array, None if its elements are of another kind."""
-    try:
-        made = np.asarray(value)
-    except (TypeError, ValueError):  # rows of unequal length, or no sequence
-        return None
-    if made.dtype.kind not in kinds and (made.size or made.dtype.kind != "f"):
-        return None
-    return made if dtype is None else made.astype(dtype, copy=False)
-
-
-def _as_annotated(value: Any, hint: Any) -> object:
-    """Return a value that fits, converted to the annotated list or tuple of arrays."""
-    origin, inner = typing.get_origin(hint), typing.get_args(hint)
-    if isinstance(value, list | tuple) and origin in SEQUENCES and any(row[0] == inner[0] for row in ARRAYS):
-        value = [_checked("", element, inner[:1]) for element in value]
-    return origin(value) if origin in (list, tuple) else value
 
 
 def _fits(value: object, hint: Any) -> bool:

@@ -181,7 +181,10 @@ def fit_motions(source: FloatArray, target: FloatArray, motions: FloatArray) -> 
     towards = size * np.append(w, np.log(overall.scale))
     step, A = np.linalg.lstsq(along[3:], towards, rcond=OPEN)[0], np.eye(4)
     for _ in range(MAX_STEPS):
-        A = _finite_motion(along @ step, centre, size) @ A
+        motion, generator = along @ step, np.zeros((4, 4))
+        generator[:3, :3] = (skew(motion[3:6]) + motion[6] * np.eye(3)) / size
+        generator[:3, 3] = motion[:3] - generator[:3, :3] @ centre
+        A = expm(generator) @ A
         x = source @ A[:3, :3].T + A[:3, 3]
         J = similarity_motions(x, centre=centre, size=size).reshape(-1, 7) @ along
         step = np.linalg.lstsq(J, (target - x).ravel(), rcond=None)[0]
@@ -189,14 +192,6 @@ def fit_motions(source: FloatArray, target: FloatArray, motions: FloatArray) -> 
             break
     scale = float(np.cbrt(np.linalg.det(A[:3, :3])))
     return Similarity(scale, A[:3, :3] / scale, A[:3, 3])
-
-
-def _finite_motion(motion: FloatArray, centre: FloatArray, size: float) -> FloatArray:
-    """Return the finite motion of a combination (7,) of `similarity_motions`, homogeneous, (4, 4)."""
-    generator = np.zeros((4, 4))
-    generator[:3, :3] = (skew(motion[3:6]) + motion[6] * np.eye(3)) / size
-    generator[:3, 3] = motion[:3] - generator[:3, :3] @ centre
-    return np.asarray(expm(generator))
 
 
 def nearest_rotation(matrix: FloatArray) -> FloatArray:

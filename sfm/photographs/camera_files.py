@@ -87,7 +87,17 @@ def header_of(path: Path, source: Path | io.BytesIO) -> CameraHeader:
     Raises:
         Exception: of many kinds, if the file is damaged.
     """
-    return _heif_header(source) if path.suffix.lower() in HEIF else _raw_header(source)
+    if path.suffix.lower() not in HEIF:
+        return _raw_header(source)
+    image = _heif_image(source)
+    turns, exif = _turns(image), Image.Exif()
+    exif.load(image.info.get("exif") or b"")
+    exif[ExifTags.Base.Orientation] = ORIENTATION.get(turns, 1)
+    turned = sum(value for kind, value in turns if kind == "irot") % 180 != 0
+    xmp = image.info.get("xmp")
+    return CameraHeader(
+        image.size[::-1] if turned else image.size, exif, xmp if isinstance(xmp, bytes) else b""
+    )
 
 
 def pixels_of(path: Path, data: bytes) -> AnyArray:
@@ -138,23 +148,18 @@ def _turns(image: Any) -> tuple[tuple[str, int], ...]:
     return tuple(step for step in image._c_image.transformations if step[0] in ("irot", "imir"))
 
 
-def _heif_header(source: Path | io.BytesIO) -> CameraHeader:
-    image = _heif_image(source)
-    turns, exif = _turns(image), Image.Exif()
-    exif.load(image.info.get("exif") or b"")
-    exif[ExifTags.Base.Orientation] = ORIENTATION.get(turns, 1)
-    turned = sum(value for kind, value in turns if kind == "irot") % 180 != 0
-    xmp = image.info.get("xmp")
-    return CameraHeader(
-        image.size[::-1] if turned else image.size, exif, xmp if isinstance(xmp, bytes) else b""
-    )
-
-
 def _raw_header(source: Path | io.BytesIO) -> CameraHeader:
     """Return the header of a raw file; its EXIF data are in a TIFF header, else in that of its preview."""
     import rawpy
 
-    exif = _tiff_exif(source)
+    exif = Image.Exif()
+    try:
+        with source.open("rb") if isinstance(source, Path) else io.BytesIO(source.getvalue()) as file:
+            exif.load_from_fp(file)
+            for part in (ExifTags.IFD.Exif, ExifTags.IFD.GPSInfo):  # before the file is closed
+                exif.get_ifd(part)
+    except Exception:  # it is no TIFF file, or damaged: many kinds
+        exif = Image.Exif()
     with rawpy.imread(str(source) if isinstance(source, Path) else source) as raw:
         size = raw.sizes.width, raw.sizes.height
         if not exif.get_ifd(ExifTags.IFD.Exif):
@@ -163,30 +168,12 @@ def _raw_header(source: Path | io.BytesIO) -> CameraHeader:
             except rawpy.LibRawError:  # it has none, or of another format
                 preview = None
             if preview is not None and isinstance(preview.data, bytes):  # a JPEG, else pixels
-                exif = _preview_exif(preview.data)
+                try:
+                    with Image.open(io.BytesIO(preview.data), formats=("JPEG",)) as image:
+                        exif = image.getexif()
+                except Exception:  # as above
+                    exif = Image.Exif()
     directory = exif.get_ifd(ExifTags.IFD.Exif)
     # they state the picture that the camera would develop, some pixels smaller: nothing was resampled
     directory[ExifTags.Base.ExifImageWidth], directory[ExifTags.Base.ExifImageHeight] = size
     return CameraHeader(size, exif)
-
-
-def _tiff_exif(source: Path | io.BytesIO) -> Image.Exif:
-    """Return the EXIF data of a raw file that is a TIFF file, empty for others."""
-    exif = Image.Exif()
-    try:
-        with source.open("rb") if isinstance(source, Path) else io.BytesIO(source.getvalue()) as file:
-            exif.load_from_fp(file)
-            for directory in (ExifTags.IFD.Exif, ExifTags.IFD.GPSInfo):  # before the file is closed
-                exif.get_ifd(directory)
-    except Exception:  # of damaged or other headers, many kinds
-        return Image.Exif()
-    return exif
-
-
-def _preview_exif(data: bytes) -> Image.Exif:
-    """Return the EXIF data of the JPEG preview in a raw file, empty without any."""
-    try:
-        with Image.open(io.BytesIO(data), formats=("JPEG",)) as image:
-            return image.getexif()
-    except Exception:  # as above
-        return Image.Exif()

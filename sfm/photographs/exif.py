@@ -418,7 +418,15 @@ def opened_header(path: Path, source: Path | io.BytesIO) -> Iterator[Image.Image
     """
     _refuse_unconverted(path)
     if is_camera_file(path):
-        yield _camera_header(path, source)
+        if source is path and path.exists() and not path.is_file():  # reading a pipe would never end
+            raise PhotographError(f"{path.name}: not a file, a photograph is needed")
+        with _PILLOW, warnings.catch_warnings(action="ignore"):
+            try:
+                header = header_of(path, source)
+            except Exception as error:  # the libraries fail on damaged files in many ways
+                raise PhotographError(f"{path.name}: {_reason(path, error)}") from error
+        _refuse_large(path, header.size)
+        yield header
         return
     with _PILLOW, warnings.catch_warnings(action="ignore"):
         # Pillow's limit is below the size of aerial scans
@@ -449,19 +457,6 @@ def stored_size(header: Image.Image | CameraHeader) -> tuple[int, int]:
         width, height = header.tag_v2[ExifTags.Base.ImageWidth], header.tag_v2[ExifTags.Base.ImageLength]
         return int(width), int(height)
     return size
-
-
-def _camera_header(path: Path, source: Path | io.BytesIO) -> CameraHeader:
-    """Return the header of a file of a telephone or a raw file, as `opened_header`."""
-    if source is path and path.exists() and not path.is_file():  # reading a pipe would never end
-        raise PhotographError(f"{path.name}: not a file, a photograph is needed")
-    with _PILLOW, warnings.catch_warnings(action="ignore"):
-        try:
-            header = header_of(path, source)
-        except Exception as error:  # the libraries fail on damaged files in many ways
-            raise PhotographError(f"{path.name}: {_reason(path, error)}") from error
-    _refuse_large(path, header.size)
-    return header
 
 
 def _refuse_large(path: Path, size: tuple[int, int]) -> None:

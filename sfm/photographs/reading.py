@@ -125,9 +125,16 @@ def read_for_display(path: Path, *, shrink: int = 1) -> AnyArray:
     with opened_header(path, io.BytesIO(data)) as header:
         size = stored_size(header)
     refuse_bomb(path, size, data)
-    if is_camera_file(path):
-        return _displayed(_camera_pixels(path, data), shrink)
-    return decoded_as_stored(path, data, flags[shrink])
+    if not is_camera_file(path):
+        return decoded_as_stored(path, data, flags[shrink])
+    pixels = _camera_pixels(path, data)
+    if pixels.dtype == np.uint16:
+        pixels = (pixels >> 8).astype(np.uint8)
+    pixels = cv2.cvtColor(pixels, cv2.COLOR_GRAY2BGR if pixels.ndim == 2 else cv2.COLOR_RGB2BGR)
+    if shrink > 1:
+        shown = -(-pixels.shape[1] // shrink), -(-pixels.shape[0] // shrink)
+        pixels = cv2.resize(pixels, shown, interpolation=cv2.INTER_AREA)
+    return np.asarray(pixels)
 
 
 def decoded_as_stored(path: Path, data: bytes, flags: int) -> AnyArray:
@@ -162,26 +169,6 @@ def _camera_pixels(path: Path, data: bytes) -> AnyArray:
         ) from error
 
 
-def _channel_of(pixels: AnyArray, channel: str) -> AnyArray:
-    """Return a channel of red, green and blue (H, W, 3), or grey pixels as they are, (H, W)."""
-    if pixels.ndim == 2:
-        return pixels
-    if channel == "luminance":
-        return np.asarray(cv2.cvtColor(pixels, cv2.COLOR_RGB2GRAY))
-    return np.ascontiguousarray(pixels[:, :, ("red", "green", "blue").index(channel)])
-
-
-def _displayed(pixels: AnyArray, shrink: int) -> AnyArray:
-    """Return pixels as `read_for_display` does."""
-    if pixels.dtype == np.uint16:
-        pixels = (pixels >> 8).astype(np.uint8)
-    pixels = cv2.cvtColor(pixels, cv2.COLOR_GRAY2BGR if pixels.ndim == 2 else cv2.COLOR_RGB2BGR)
-    if shrink > 1:
-        size = -(-pixels.shape[1] // shrink), -(-pixels.shape[0] // shrink)
-        pixels = cv2.resize(pixels, size, interpolation=cv2.INTER_AREA)
-    return np.asarray(pixels)
-
-
 def _decode(path: Path, channel: str, *, may_be_plain: bool = False) -> AnyArray:
     """Return the pixels of a file, as `read_photograph` does.
 
@@ -194,7 +181,12 @@ def _decode(path: Path, channel: str, *, may_be_plain: bool = False) -> AnyArray
     if not may_be_plain:
         refuse_bomb(path, size, data)
     if is_camera_file(path):
-        return _of_size(path, _channel_of(_camera_pixels(path, data), channel), size)
+        pixels = _camera_pixels(path, data)
+        if pixels.ndim != 2 and channel == "luminance":
+            pixels = np.asarray(cv2.cvtColor(pixels, cv2.COLOR_RGB2GRAY))
+        elif pixels.ndim != 2:
+            pixels = np.ascontiguousarray(pixels[:, :, ("red", "green", "blue").index(channel)])
+        return _of_size(path, pixels, size)
     colour = cv2.IMREAD_GRAYSCALE if channel == "luminance" else cv2.IMREAD_COLOR
     image = _of_size(path, decoded_as_stored(path, data, colour | cv2.IMREAD_ANYDEPTH), size)
     if image.dtype not in (np.uint8, np.uint16):

@@ -145,17 +145,17 @@ class Video:
 
     def remarks(self) -> tuple[str, ...]:
         """Return a sentence on each thing that a person should know, after its frames were decoded."""
-        return (*self.kinds, *remarks_on_times(np.array(self.times_s)), *self._remarks_on_damage())
-
-    def _remarks_on_damage(self) -> tuple[str, ...]:
         times = np.array(self.times_s)
+        said = [*self.kinds, *remarks_on_times(times)]
         last, period = float(times[-1]), float(np.median(np.diff(times))) if len(times) > 1 else 0.0
         missing = self.duration_s - last - period
         if missing > max(2 * period, 0.5 if not self.damaged_s else 0.0):
-            return (f"its end cannot be read: {last:.1f} of {self.duration_s:.1f} s are used; copy it again",)
-        if self.damaged_s:
-            return (f"damaged frames are left out, the first after {self.damaged_s[0]:.2f} s",)
-        return ()
+            said.append(
+                f"its end cannot be read: {last:.1f} of {self.duration_s:.1f} s are used; copy it again"
+            )
+        elif self.damaged_s:
+            said.append(f"damaged frames are left out, the first after {self.damaged_s[0]:.2f} s")
+        return tuple(said)
 
 
 def missing_av() -> bool:

@@ -152,15 +152,13 @@ def reduced_rows(observed_kind: ObservedKind, layout: Unknowns, state: State) ->
         columns.append(at)
         parts.append(J @ by)
     reduced = Reduced(np.hstack(columns), np.concatenate(parts, axis=2), linear.difference)
-    return reduced if len(observed_kind.weight) == len(observed_kind.kind) else _together(reduced)
-
-
-def _together(reduced: Reduced) -> Reduced:
-    """Return mutually correlated observations as a single observation."""
-    n, d, u = reduced.J.shape
-    J = np.zeros((n, d, n, u))
-    J[np.arange(n), :, np.arange(n)] = reduced.J
-    return Reduced(reduced.columns.reshape(1, n * u), J.reshape(1, n * d, n * u), reduced.l.reshape(1, n * d))
+    if len(observed_kind.weight) == len(observed_kind.kind):
+        return reduced
+    n, d, u = reduced.J.shape  # mutually correlated observations are a single observation
+    joint = np.zeros((n, d, n, u))
+    joint[np.arange(n), :, np.arange(n)] = reduced.J
+    rows = joint.reshape(1, n * d, n * u)
+    return Reduced(reduced.columns.reshape(1, n * u), rows, reduced.l.reshape(1, n * d))
 
 
 def _of_block(block: Block, layout: Unknowns, state: State) -> tuple[IntArray, FloatArray]:

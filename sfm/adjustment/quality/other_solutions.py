@@ -281,7 +281,9 @@ class _Place:
 
     def describe(self, other: Estimate, vPv: float) -> OtherSolution:
         """Return the description of another solution by its differences from the result."""
-        result, number = self.adjustment.estimate, self._number
+        result = self.adjustment.estimate
+        free = (k for k, lens in enumerate(result.cameras) if lens.free[lens.parts[0]].any())
+        number = next(free, 0)  # the first camera with free c, otherwise the first camera
         camera = other.cameras[number]
         c, sigma = float(camera.parameters[0]), float(self.adjustment.interior_sigma(number)[0])
         return OtherSolution(
@@ -304,12 +306,6 @@ class _Place:
     def _sigma(self) -> FloatArray:
         variance: FloatArray = np.trace(self.adjustment.covariance.points, axis1=1, axis2=2) / 3
         return np.sqrt(variance)
-
-    @cached_property
-    def _number(self) -> int:
-        """The first camera with free c, otherwise the first camera."""
-        cameras = self.adjustment.estimate.cameras
-        return next((k for k, camera in enumerate(cameras) if camera.free[camera.parts[0]].any()), 0)
 
 
 def _apart(points: FloatArray, others: FloatArray, sigma: FloatArray) -> float:

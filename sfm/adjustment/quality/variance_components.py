@@ -181,7 +181,11 @@ def estimate_components(
         sigma0 = np.maximum(sigma0, least / factor)
         if np.abs(sigma0 - 1).max() <= LAST_CHANGE:
             at_least = (factor <= (1 + LAST_CHANGE) * least).any() and adjustment.sigma0 < 1
-            return _as_weighted(adjustment) if at_least else adjustment, factor, True
+            # If image points are better than their weights, the a posteriori sigma0 would also scale the
+            # standard deviations of control.
+            if at_least and adjustment.sigma0 > 0:
+                adjustment = replace(adjustment, sigma0=1.0, covariance=adjustment.cofactors)
+            return adjustment, factor, True
         missing.append(np.log(sigma0))
         factor = np.maximum(factor * np.exp(_secant_steps(np.log(tried), missing)), least)
         first = _cycle_start(tried, rejected, factor)
@@ -247,7 +251,10 @@ def estimate_common_part(
         redundancy = adjustment.redundancy_numbers[used].mean(axis=1)
         S = np.einsum("k,pkab,qkba->pq", redundancy, PV, PV)
         scores = np.einsum("ka,pkab,kb->p", Pv, parts[:, used], Pv)
-        before, squares = squares, _solve_nonnegative(S, scores)
+        before, squares = squares, np.linalg.solve(S, scores)
+        for row, other in ((0, 1), (1, 0)):
+            if squares[row] < 0:  # 0 in its place
+                squares[row], squares[other] = 0.0, scores[other] / S[other, other]
         change = np.sqrt(_median_trace(squares, parts) / _median_trace(before, parts)) - 1
         share = squares[1] / _median_trace(squares, parts) - before[1] / _median_trace(before, parts)
         if max(abs(change), abs(share)) <= LAST_CHANGE_OF_PARTS:
@@ -256,33 +263,10 @@ def estimate_common_part(
     return factor, max(common, MIN_SIGMA_PX)
 
 
-def _solve_nonnegative(S: FloatArray, right: FloatArray) -> FloatArray:
-    """Return the solution of two normal equations, (2,), with 0 instead of a negative value.
-
-    right: right-hand side of the equations, (2,).
-    """
-    squares = np.linalg.solve(S, right)
-    for row, other in ((0, 1), (1, 0)):
-        if squares[row] < 0:
-            squares[row], squares[other] = 0.0, right[other] / S[other, other]
-    return np.asarray(squares)
-
-
 def _median_trace(squares: FloatArray, parts: FloatArray) -> float:
     """Return the median variance of an image coordinate, px^2."""
     C = np.einsum("p,pkab->kab", squares, parts)
     return float(np.median(np.trace(C, axis1=1, axis2=2))) / 2
-
-
-def _as_weighted(adjustment: Adjustment) -> Adjustment:
-    """Return an adjustment with the standard deviations of its weights, that is sigma0 = 1.
-
-    If image points are better than their weights, the a posteriori sigma0 would also scale the standard
-    deviations of control.
-    """
-    if not adjustment.sigma0 > 0:
-        return adjustment
-    return replace(adjustment, sigma0=1.0, covariance=adjustment.cofactors)
 
 
 def _cycle_start(tried: list[FloatArray], rejected: list[BoolArray], factor: FloatArray) -> int | None:

@@ -78,7 +78,11 @@ class RigidFrames(Group):
     def _fitted(self, X: FloatArray) -> tuple[FloatArray, FloatArray]:
         """Return the motion R, t that fits the frame to its points best: X near R local + t."""
         W = self.weights.reshape(-1, 3)
-        R, t = _motion(self.value, X, W.mean(axis=1))
+        w = W.mean(axis=1)
+        a, b = ((x * w[:, None]).sum(axis=0) / w.sum() for x in (self.value, X))
+        U, _, Vt = np.linalg.svd((X - b).T @ ((self.value - a) * w[:, None]))
+        R = U @ np.diag([1.0, 1.0, np.linalg.det(U @ Vt)]) @ Vt
+        t = b - R @ a
         for _ in range(5):  # iterations with the weights of single coordinates
             local = (X - t) @ R
             H, _ = self._by_motion(local)
@@ -130,11 +134,3 @@ class RigidFrames(Group):
         U, singular, _ = np.linalg.svd(root * about.reshape(len(root), -1), full_matrices=False)
         U, flat = U[:, singular > ON_LINE * singular[0]], A.reshape(len(root), -1)
         return np.asarray(flat - U / root @ (U.T @ (root * flat))).reshape(A.shape)
-
-
-def _motion(source: FloatArray, target: FloatArray, w: FloatArray) -> tuple[FloatArray, FloatArray]:
-    """Return R, t with target near R source + t, by weighted least squares."""
-    a, b = ((x * w[:, None]).sum(axis=0) / w.sum() for x in (source, target))
-    U, _, Vt = np.linalg.svd((target - b).T @ ((source - a) * w[:, None]))
-    R = U @ np.diag([1.0, 1.0, np.linalg.det(U @ Vt)]) @ Vt
-    return R, b - R @ a

@@ -14,8 +14,8 @@ from matplotlib.colors import ListedColormap, LogNorm
 from matplotlib.figure import Figure
 from PIL import Image
 
-from sfm.model.conventions import SUPERSCRIPTS, AnyArray, FloatArray, IntArray
-from sfm.report.figures.plot_data import Plot, PlotCamera, PlotData
+from sfm.model.conventions import SUPERSCRIPTS, AnyArray, FloatArray
+from sfm.report.figures.plot_data import Plot, PlotData
 
 BLUE, RED, GREY, GREEN, ORANGE = "#1f5fa8", "#c8372d", "#8a8f98", "#2b7a4b", "#d98a1f"
 DPI = 110
@@ -176,7 +176,15 @@ def network_figure(shown: PlotData) -> Figure:
         for k, camera in enumerate(shown.cameras):
             of_camera = np.flatnonzero(shown.camera == k)
             colour = CAMERA_COLOURS[k % len(CAMERA_COLOURS)]
-            edges = _pyramids(shown, of_camera, camera, size) @ axes_from_object.T
+            # the edges of the viewing pyramid of each photograph, (edges, 2, 3)
+            x, y = (side / 2 / camera.c_px for side in camera.size_px)
+            corners = np.array([[-x, -y, -1], [x, -y, -1], [x, y, -1], [-x, y, -1]]) * size
+            ends = []
+            for i in of_camera:
+                tips = shown.position[i] + corners @ shown.rotation[i].T
+                for tip, next_tip in zip(tips, np.roll(tips, -1, axis=0), strict=True):
+                    ends += [(shown.position[i], tip), (tip, next_tip)]
+            edges = np.reshape(np.array(ends, dtype=float), (-1, 2, 3)) @ axes_from_object.T
             panel.add_collection(LineCollection(list(edges[:, :, plane]), colors=colour, linewidths=0.8))
             label = _plain(camera.name)
             panel.plot(*position[of_camera][:, plane].T, "o", color=colour, markersize=4, label=label)
@@ -385,19 +393,6 @@ def plan_axes(
         Vt[2] *= -1
     Vt[1] *= np.sign(np.linalg.det(Vt))
     return Vt, ("along", "across", "up from the main plane")
-
-
-def _pyramids(shown: PlotData, images: IntArray, camera: PlotCamera, size: float) -> FloatArray:
-    """Return the edges of the viewing pyramid of each photograph, shape (edges, 2, 3)."""
-    width, height = camera.size_px
-    x, y = width / 2 / camera.c_px, height / 2 / camera.c_px
-    corners = np.array([[-x, -y, -1], [x, -y, -1], [x, y, -1], [-x, y, -1]]) * size
-    edges = []
-    for i in images:
-        tips = shown.position[i] + corners @ shown.rotation[i].T
-        for k in range(4):
-            edges += [(shown.position[i], tips[k]), (tips[k], tips[(k + 1) % 4])]
-    return np.reshape(np.array(edges, dtype=float), (-1, 2, 3))
 
 
 def _arrows(panel: Axes, xy: FloatArray, v: FloatArray, colour: str) -> None:

@@ -82,7 +82,11 @@ def coplanar_sets(points: FloatArray, *, seed: int = 0) -> Iterator[IntArray]:
         seed: of the random choice.
     """
     xyz, found = np.asarray(points, dtype=float), set[tuple[int, ...]]()
-    for chosen in _triples(len(xyz), seed):
+    triples: Iterable[tuple[int, ...]] = combinations(range(len(xyz)), 3)
+    if math.comb(len(xyz), 3) > MOST_PLANES:
+        rng = np.random.default_rng(seed)
+        triples = [tuple(rng.choice(len(xyz), 3, replace=False)) for _ in range(MOST_PLANES)]
+    for chosen in triples:
         origin, p, q = xyz[list(chosen)]
         normal = np.cross(p - origin, q - origin)
         extent = np.linalg.norm(xyz - origin, axis=1).max() * np.linalg.norm(normal)
@@ -90,13 +94,6 @@ def coplanar_sets(points: FloatArray, *, seed: int = 0) -> Iterator[IntArray]:
         if extent > 0 and len(near) >= MIN_POINTS and tuple(near) not in found:
             found.add(tuple(near))
             yield near
-
-
-def _triples(n: int, seed: int) -> Iterable[tuple[int, ...]]:
-    if math.comb(n, 3) <= MOST_PLANES:
-        return combinations(range(n), 3)
-    rng = np.random.default_rng(seed)
-    return [tuple(rng.choice(n, 3, replace=False)) for _ in range(MOST_PLANES)]
 
 
 def _collineation(Q: FloatArray, uv: FloatArray) -> FloatArray:

@@ -70,7 +70,8 @@ class Fronts:
     @property
     def operations(self) -> float:
         """Number of operations of the factorisation, counting products and sums."""
-        return float(sum(_operations(6.0 * f.pivots, 6.0 * len(f.photographs)) for f in self.fronts))
+        sizes = ((6.0 * f.pivots, 6.0 * (len(f.photographs) - f.pivots)) for f in self.fronts)
+        return float(sum(pivots**3 / 3 + pivots**2 * rest + pivots * rest**2 for pivots, rest in sizes))
 
     def bytes(self, border: int, vectors: float) -> float:
         """Return the peak memory of factor and inverse, bytes.
@@ -191,12 +192,6 @@ def _halves(parents: list[int]) -> tuple[int, int]:
         return tops[len(tops) // 2 - 1] + 1, last + 1
     below = [g for g, parent in enumerate(parents) if parent == last]
     return (below[len(below) // 2 - 1] + 1 if len(below) > 1 else 0), last
-
-
-def _operations(pivots: float, size: float) -> float:
-    """Return the number of operations that eliminate some unknowns of a symmetric matrix."""
-    rest = size - pivots
-    return pivots**3 / 3 + pivots**2 * rest + pivots * rest**2
 
 
 @kernel

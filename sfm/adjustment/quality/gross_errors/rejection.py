@@ -76,7 +76,11 @@ def find_optimum(
     if reject == "tau":
         optimum, weight = _snoop_all(run, optimum, weight, alpha)
     else:
-        bends = _distorting_points(run, optimum, weight)
+        # Image points that a robust start left out and that have very large residuals distort their
+        # photograph even with the bounded influence of Huber's weights.
+        layout = run.problem.layout
+        length = residual_lengths(layout.observations, residuals(layout.observations, optimum.state))
+        bends = np.asarray(layout.active & (weight == 0) & (length > FAR_OFF * np.nanmedian(length)))
         out = bends if reject == "tukey" else None  # even bounded, their influence may hide a good one
         robust, factor = _reweight(run, optimum, weight, huber_weights, out=out)
         if _distorted_photographs(run, state, robust.state).any():
@@ -396,16 +400,6 @@ def _without_angle(problem: Problem, state: State, used: BoolArray, changed: Boo
     apart, rays = np.zeros(count), np.bincount(o.point[rows], minlength=count)
     np.maximum.at(apart, o.point[rows], np.linalg.norm(ray - first[o.point[rows]], axis=1))
     return np.asarray((suspect & (rays > 1) & (apart < np.radians(MIN_ANGLE_DEG)))[o.point])
-
-
-def _distorting_points(run: Run, optimum: Optimum, weight: FloatArray) -> BoolArray:
-    """Return the image points that a robust start left out and that have very large residuals, (k,).
-
-    They distort their photograph even with the bounded influence of Huber's weights.
-    """
-    layout = run.problem.layout
-    length = residual_lengths(layout.observations, residuals(layout.observations, optimum.state))
-    return np.asarray(layout.active & (weight == 0) & (length > FAR_OFF * np.nanmedian(length)))
 
 
 def _reweight(
