@@ -246,7 +246,12 @@ def _chosen(
     taken: list[Pose] = []
     views = list(views)
     for _ in range(min(count, len(views))):
-        scores = [_worst(effect, Q, A, f) for A in rows]
+        scores = []  # largest variance of a corner with each view
+        for A in rows:
+            AQ = A @ Q
+            half = np.linalg.solve(np.linalg.cholesky(np.eye(len(A)) + AQ @ A.T), AQ[:, :f])
+            with_view = Q[:f, :f] - half.T @ half
+            scores.append(float(np.einsum("nis,st,nit->n", effect, with_view, effect).max()))
         best = int(np.argmin(scores))
         observed = rows.pop(best)
         AQ = observed @ Q
@@ -296,11 +301,3 @@ def _information(
     basis, _ = np.linalg.qr(pose)
     share = np.isfinite(view.xy[:, 0]).sum() / max(len(seen), 1)
     return np.asarray(np.sqrt(share) * (A - basis @ (basis.T @ A)))
-
-
-def _worst(effect: FloatArray, Q: FloatArray, A: FloatArray, f: int) -> float:
-    """Return the largest variance of a corner with further observations."""
-    AQ = A @ Q
-    half = np.linalg.solve(np.linalg.cholesky(np.eye(len(A)) + AQ @ A.T), AQ[:, :f])
-    with_view = Q[:f, :f] - half.T @ half
-    return float(np.einsum("nis,st,nit->n", effect, with_view, effect).max())

@@ -751,6 +751,12 @@ class MarkingSession:
         needs = np.maximum(3 - number, 1)
         if following is not None:
             oriented, needs = following.estimate.oriented, marks_needed(following)[0]
+        hashes, now = self._marking.hashes, self._hashes
+        changed = {
+            name: "changed since it was marked: measure its marks again"
+            for name, hashed in hashes.items()
+            if hashed and now.get(name, hashed) != hashed
+        }
         return [
             {
                 "index": i,
@@ -760,15 +766,10 @@ class MarkingSession:
                 "oriented": bool(oriented[i]),
                 "marks": int(number[i]),
                 "needs": int(needs[i]),
-                "changed": self._what_changed(name),
+                "changed": changed.get(name),
             }
             for i, name in enumerate(project.photographs.names)
         ]
-
-    def _what_changed(self, photograph: str) -> str | None:
-        marked, now = self._marking.hashes.get(photograph), self._hashes.get(photograph)
-        changed = marked and now and marked != now
-        return "changed since it was marked: measure its marks again" if changed else None
 
     def _shown_points(self, marks: list[dict[str, Any]]) -> list[dict[str, Any]]:
         following, control = self._following, stated_points(self.project, self._marking)
