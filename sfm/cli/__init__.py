@@ -9,8 +9,6 @@ import atexit
 import gc
 import re
 import sys
-from collections.abc import Sequence
-from typing import Any
 
 from sfm.cli.process import INTERRUPTED, INTERRUPTED_TEXT, guard_streams, loading, stopped_once
 from sfm.model.errors import KolinearError
@@ -66,24 +64,20 @@ def _run() -> None:
         code = commands()(prog_name="kolinear", standalone_mode=False)
     except USAGE_ERROR as error:
         command = error.ctx.command_path if error.ctx else "kolinear"
-        said = f"{error.format_message().rstrip()}{_decimal_comma(error, sys.argv[1:])}"
+        said, arguments = error.format_message().rstrip(), sys.argv[1:]
+        values = (
+            following if given == name else given.removeprefix(f"{name}=")
+            for name in getattr(getattr(error, "param", None), "opts", ())
+            for given, following in zip(arguments, [*arguments[1:], ""], strict=True)
+        )
+        if "number" in said:
+            comma = next((value for value in values if re.fullmatch(r"[-+]?\d+,\d+", value)), None)
+            said += "" if comma is None else f"; use a decimal point, not a comma: {comma.replace(',', '.')}"
         _refuse(f"{said} (see {command} --help)".replace(". (see", " (see"))
     if code == INTERRUPTED:  # typer turns Ctrl-C into this code without a message
         raise KeyboardInterrupt
     if isinstance(code, int) and code:
         raise SystemExit(code)
-
-
-def _decimal_comma(error: Any, arguments: Sequence[str]) -> str:
-    """Return a hint if the value of a numeric option has a decimal comma, else an empty text."""
-    if "number" not in error.format_message():
-        return ""
-    for name in getattr(getattr(error, "param", None), "opts", ()):
-        for given, following in zip(arguments, (*arguments[1:], ""), strict=True):
-            value = following if given == name else given.removeprefix(f"{name}=")
-            if re.fullmatch(r"[-+]?\d+,\d+", value):
-                return f"; use a decimal point, not a comma: {value.replace(',', '.')}"
-    return ""
 
 
 def _refuse(message: str, *, code: int = BAD_INPUT) -> None:

@@ -63,7 +63,13 @@ def match_photographs(
     if points is not None:
         names, xy, start = read_points_to_match(points)
     else:
-        names, xy, start = ("1",), _parse_point(str(point)), None
+        try:
+            xy = np.array([[float(part) for part in str(point).split(",")]])
+        except ValueError:
+            xy = np.zeros((1, 0))
+        if xy.shape != (1, 2) or not np.isfinite(xy).all():
+            raise SurveyFileError(f"match: --point {str(point)!r}, expected COL,ROW such as 812.5,403")
+        names, start = ("1",), None
     left, right = _photograph("LEFT", left_path), _photograph("RIGHT", right_path)
     with whole_outputs(out, picture) as (table_file, picture_part):
         matches = match_points(left, right, xy, settings, xy_right=start)
@@ -103,13 +109,3 @@ def _photograph(which: str, path: Path) -> AnyArray:
     if path.is_dir():
         raise PhotographError(f"{which} {path}: is a folder, expected a photograph")
     return read_photograph(path)
-
-
-def _parse_point(text: str) -> FloatArray:
-    try:
-        xy = np.array([[float(part) for part in text.split(",")]])
-    except ValueError:
-        xy = np.zeros((1, 0))
-    if xy.shape != (1, 2) or not np.isfinite(xy).all():
-        raise SurveyFileError(f"match: --point {text!r}, expected COL,ROW such as 812.5,403")
-    return xy
