@@ -282,25 +282,18 @@ def mounts_of(rigs: Mapping[str, Sequence[int]], network: Network, estimate: Est
                     f"rig {rig}: camera {cameras[b].name} is oriented at no moment together with "
                     f"{listed([cameras[k].name for k in known])}; more points that both see are needed"
                 )
-            poses = [_relative(estimate, position[k], rotation[k], i, j) for k, i, j in pairs[b]]
-            position[b] = np.median([X for X, _ in poses], axis=0)
-            rotation[b] = middle_rotation(np.array([R for _, R in poses]))
+            positions, rotations = [], []  # of the camera, in the axes of the rig
+            for k, i, j in pairs[b]:
+                of_rig = estimate.rotation[i] @ rotation[k].T
+                origin = estimate.position[i] - of_rig @ position[k]
+                positions.append(of_rig.T @ (estimate.position[j] - origin))
+                rotations.append(of_rig.T @ estimate.rotation[j])
+            position[b] = np.median(positions, axis=0)
+            rotation[b] = middle_rotation(np.array(rotations))
             free[b], names[b] = True, rig
             known.append(b)
             left.remove(b)
     return Mounts(position, rotation, free, tuple(names))
-
-
-def _relative(
-    estimate: Estimate, X: FloatArray, R: FloatArray, i: int, j: int
-) -> tuple[FloatArray, FloatArray]:
-    """Return the pose of the camera of photograph j in the axes of the rig of photograph i.
-
-    X, R: mounted position and rotation of the camera of photograph i.
-    """
-    of_rig = estimate.rotation[i] @ R.T
-    origin = estimate.position[i] - of_rig @ X
-    return np.asarray(of_rig.T @ (estimate.position[j] - origin)), of_rig.T @ estimate.rotation[j]
 
 
 def middle_rotation(R: FloatArray) -> FloatArray:

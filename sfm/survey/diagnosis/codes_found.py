@@ -164,6 +164,16 @@ def describe_codes(survey: Survey, photographs: MeasuredPhotographs) -> str:
     settings = survey.targets
     of_each = (f"{name}: {count}" for name, count in zip(photographs.names, codes, strict=True))
     codes_read = f" ({listed(of_each, most=10)})" if with_codes else ""
+    size = ""
+    small = sum(int((seen.rejected_flag == Flag.TOO_SMALL).sum()) for seen in photographs.targets)
+    if too_small := small_codes(photographs.targets):
+        size = f"; {_as_error_text(*too_small)}"
+    elif small >= MIN_POINTS * len(photographs.targets):
+        size = (
+            f"; {counted(small, 'candidate')} {agreeing(small, 'is|are')} smaller than min_diameter_px = "
+            f"{settings.min_diameter_px:g}; codes "
+            f"are read from dots of {MIN_DOT_PX:g} px on in sharp photographs"
+        )
     return (
         f"no two photographs have {MIN_POINTS} coded targets in common, which their orientation needs: "
         f"{counted(sum(targets), 'target')} found in {counted(len(targets), 'photograph')}, "
@@ -171,7 +181,7 @@ def describe_codes(survey: Survey, photographs: MeasuredPhotographs) -> str:
         f"{with_codes} of them{codes_read}; check in [targets] "
         f"codes = '{settings.codes}', "
         f"polarity = '{settings.polarity}' and min_diameter_px = {settings.min_diameter_px:g}"
-        f"{_describe_size(survey, photographs)}{_other_settings(survey, photographs)}"
+        f"{size}{_other_settings(survey, photographs)}"
     )
 
 
@@ -207,20 +217,6 @@ def small_codes(targets: Sequence[Targets]) -> tuple[Remark, ...]:
 def _as_error_text(said: Remark) -> str:
     """Return a remark as part of an error message."""
     return f"{said.text.rstrip('.')}: {said.remedy.rstrip('.')}"
-
-
-def _describe_size(survey: Survey, photographs: MeasuredPhotographs) -> str:
-    """Report codes too small to read, else candidates below the least diameter, if there are any."""
-    if small := small_codes(photographs.targets):
-        return f"; {_as_error_text(*small)}"
-    count = sum(int((targets.rejected_flag == Flag.TOO_SMALL).sum()) for targets in photographs.targets)
-    if count < MIN_POINTS * len(photographs.targets):
-        return ""
-    return (
-        f"; {counted(count, 'candidate')} {agreeing(count, 'is|are')} smaller than min_diameter_px = "
-        f"{survey.targets.min_diameter_px:g}; codes "
-        f"are read from dots of {MIN_DOT_PX:g} px on in sharp photographs"
-    )
 
 
 def _other_settings(survey: Survey, photographs: MeasuredPhotographs) -> str:

@@ -152,7 +152,10 @@ def _read_gcp_list(path: Path) -> _Rows:
                 f"{path}, {where}: {counted(len(fields) + 1, 'field')} between spaces, "
                 "expected X Y Z x_px y_px photograph [name]"
             )
-        x, y, z, column, row = (_number(text, path, number) for text in fields)
+        for text in fields:
+            if NUMBER.fullmatch(text) is None:
+                raise SurveyFileError(f"{path}, {where}: found '{text[:40]}', expected a number")
+        x, y, z, column, row = map(float, fields)
         if not all(map(math.isfinite, (x, y, column, row))):
             raise SurveyFileError(f"{path}, {where}: found NaN, which only Z may be")
         image = PHOTOGRAPH.match(names)
@@ -169,12 +172,6 @@ def _read_gcp_list(path: Path) -> _Rows:
         rows.xy.append((column, row))
         rows.image_line.append(number)
     return rows
-
-
-def _number(text: str, path: Path, line: int) -> float:
-    if NUMBER.fullmatch(text) is None:
-        raise SurveyFileError(f"{path}, line {line}: found '{text[:40]}', expected a number")
-    return float(text)
 
 
 class _Position(Content):

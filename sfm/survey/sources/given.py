@@ -8,7 +8,7 @@ y exchanged, another unit, or a larger photograph.
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Collection, Iterator, Sequence
+from collections.abc import Collection, Sequence
 from dataclasses import replace
 
 import numpy as np
@@ -267,9 +267,18 @@ def refuse_outside(
     count, allowed = int(outside.sum()), MAX_OUTSIDE * len(xy)
     if not count:
         return outside
+    # possible mistakes, with image points and sizes of photographs without them, px
+    mistakes = [(EXCHANGED, xy, size[:, ::-1])]
+    if given.unit == "mm":
+        mistakes.append(("read as px in place of mm they are inside", given.xy, size))
+    else:
+        read = xy.copy()
+        for lens, rows in zip(cameras, rows_of(camera, len(cameras)), strict=True):
+            read[rows] = pixel_from_image(xy[rows], lens.size_px, lens.pixel_mm)
+        mistakes.append(("read as mm in place of px they are inside", read, size))
     reasons = [
         words
-        for words, other, other_size in _alternatives(given, xy, size, cameras, camera)
+        for words, other, other_size in mistakes
         if outside_photograph(other, other_size).sum() <= (allowed if count > allowed else 0)
     ]
     if count <= allowed and not (reasons and reasons[0] == EXCHANGED):
@@ -287,20 +296,6 @@ def refuse_outside(
 
 
 EXCHANGED = "with x and y exchanged, or width and height in size_px, they are inside"
-
-
-def _alternatives(
-    given: Observations, xy: FloatArray, size: FloatArray, cameras: Sequence[Camera], camera: IntArray
-) -> Iterator[tuple[str, FloatArray, FloatArray]]:
-    """Yield (possible mistake, image points and photograph sizes without it, px)."""
-    yield EXCHANGED, xy, size[:, ::-1]
-    if given.unit == "mm":
-        yield "read as px in place of mm they are inside", given.xy, size
-        return
-    read = xy.copy()
-    for lens, rows in zip(cameras, rows_of(camera, len(cameras)), strict=True):
-        read[rows] = pixel_from_image(xy[rows], lens.size_px, lens.pixel_mm)
-    yield "read as mm in place of px they are inside", read, size
 
 
 SOURCE = SurveySource(measure_given, complete_as_measured)
