@@ -100,13 +100,12 @@ def readjust_cameras(
             cameras[k], covariance[k] = same, None
     conversions = {k: curve for k, (curve, _) in curves.items()}
     if curves and file.solution is not None:
-        anew = _adjusted(
-            file.solution,
-            {
-                curve.camera.name: _freed(curve.former, curve.camera, form.held)
-                for curve, form in curves.values()
-            },
-        )
+        freed = {}  # the parameters that correspond to the free ones of the former camera
+        for curve, form in curves.values():
+            free = corresponding_free(curve.former, curve.camera.model)
+            free &= ~np.isin(curve.camera.names, form.held)
+            freed[curve.camera.name] = replace(curve.camera, free=free, shared=())
+        anew = _adjusted(file.solution, freed)
         of_anew = None if anew is None else cameras_of(anew.solution)
         if of_anew is not None:
             adjusted = {
@@ -156,12 +155,6 @@ def _radial_terms(form: Form) -> int:
     """Return how many coefficients of radial distortion a form has."""
     names = MODELS[form.model].names_of(Role.RADIAL, Role.DENOMINATOR)
     return len([name for name in names if name not in form.held])
-
-
-def _freed(former: Camera, camera: Camera, held: tuple[str, ...]) -> Camera:
-    """Return a camera with the parameters free that correspond to the free ones of the former camera."""
-    free = corresponding_free(former, camera.model) & ~np.isin(camera.names, held)
-    return replace(camera, free=free, shared=())
 
 
 def _adjusted(solution: Solution, cameras: dict[str, Camera]) -> Adjustment | None:

@@ -126,7 +126,14 @@ def read_metadata(path: str | Path) -> Metadata:
             exif = Image.Exif()
         camera, gps = _directory(exif, ExifTags.IFD.Exif), _directory(exif, ExifTags.IFD.GPSInfo)
         xmp = image.info.get("xmp", b"")
-        several = isinstance(image, Image.Image) and _has_further_pictures(image)
+        several = False  # pictures of one size: no preview, no map of depth
+        if isinstance(image, Image.Image) and image.format in ("PNG", "WEBP"):  # animated
+            several = bool(getattr(image, "n_frames", 1) > 1)
+        elif isinstance(image, Image.Image) and image.format in ("TIFF", "MPO"):
+            first = image.size
+            with suppress(Exception):  # there is no second one, or it is damaged
+                image.seek(1)
+                several = image.size == first
     focal = _between(camera.get(ExifTags.Base.FocalLength), FOCAL_MM)
     equivalent = _between(camera.get(ExifTags.Base.FocalLengthIn35mmFilm), FOCAL_MM)
     orientation = exif.get(ExifTags.Base.Orientation, 1)
@@ -154,18 +161,6 @@ def read_metadata(path: str | Path) -> Metadata:
         position=satellite_position(gps, xmp if isinstance(xmp, bytes) else b""),
         several=several,
     )
-
-
-def _has_further_pictures(image: Image.Image) -> bool:
-    """Return whether a file has a second picture of the size of the first: no preview, no map of depth."""
-    size = image.size
-    if image.format in ("PNG", "WEBP"):  # animated: all are of one size
-        return bool(getattr(image, "n_frames", 1) > 1)
-    if image.format in ("TIFF", "MPO"):
-        with suppress(Exception):  # there is none, or it is damaged
-            image.seek(1)
-            return image.size == size
-    return False
 
 
 def _directory(exif: Image.Exif, which: ExifTags.IFD) -> dict[int, Any]:

@@ -211,21 +211,16 @@ def _lines(parts: Iterable[Part]) -> Iterator[str]:
                 lines = list(_lines(part.parts)) if part.in_text else []
             case Paragraph():
                 lines = wrapped(MARGIN + one_line(part.text), behind=4)
+            case Table() if part.facts:
+                rows = [[one_line(str(cell)) for cell in row] for row in part.cells]
+                width = min(max((len(name) for name, _ in rows), default=0), NAME_WIDTH)
+                for name, words in rows:
+                    lines += wrapped(f"{MARGIN}{name:<{width}}  {words}", behind=width + 4)
             case Table():
-                lines = _facts(part) if part.facts else _table(part)
+                lines = _table(part)
         if lines:
             yield from (*heading, *lines)
             heading = []
-
-
-def _facts(table: Table) -> list[str]:
-    rows = [[one_line(str(cell)) for cell in row] for row in table.cells]
-    width = min(max((len(name) for name, _ in rows), default=0), NAME_WIDTH)
-    return [
-        line
-        for name, words in rows
-        for line in wrapped(f"{MARGIN}{name:<{width}}  {words}", behind=width + 4)
-    ]
 
 
 def _table(table: Table) -> list[str]:

@@ -192,7 +192,13 @@ def group_plates(plates: Sequence[PlateFamily]) -> PlateGroup:
                 "place beside other plates: needed marks, tags, or an odd sum of rows and columns"
             )
         for other in grouped:
-            if _look_alike(plate, other):
+            if plate.name in TAGGED and other.name in TAGGED:
+                apart = plate.first_tag > other.last_tag or other.first_tag > plate.last_tag
+                alike = plate.dictionary == other.dictionary and not apart
+            else:
+                kinds = (tuple(GRIDS), ("checkerboard", "charuco"))
+                alike = any(plate.name in names and other.name in names for names in kinds)
+            if alike:  # a finder may take one for the other
                 raise GeometryError(
                     f"{other.name} of {other.rows} x {other.columns} and {plate.name} of {plate.rows} x "
                     f"{plate.columns} are not distinguished: needed other tags, or a plate of another kind"
@@ -200,17 +206,6 @@ def group_plates(plates: Sequence[PlateFamily]) -> PlateGroup:
         grouped.append(replace(plate, first_point=first))
         first += plate.count
     return PlateGroup(tuple(grouped))
-
-
-def _look_alike(plate: PlateFamily, other: PlateFamily) -> bool:
-    """Return whether a finder may take one plate for the other."""
-    if plate.name in TAGGED and other.name in TAGGED:
-        apart = plate.first_tag > other.last_tag or other.first_tag > plate.last_tag
-        return plate.dictionary == other.dictionary and not apart
-    crossings = ("checkerboard", "charuco")
-    return (plate.name in GRIDS and other.name in GRIDS) or (
-        plate.name in crossings and other.name in crossings
-    )
 
 
 def refuse_unusable_plate(plate: PlateFamily) -> None:

@@ -139,7 +139,13 @@ def moderate(ratio: FloatArray, sound: BoolArray, freedom: float) -> tuple[Float
     if len(ratios) >= MIN_POPULATION:
         z = np.log(ratios) - digamma(freedom / 2) + np.log(freedom / 2)
         middle = np.median(z)
-        half = _inverse_trigamma((MAD * np.median(np.abs(z - middle))) ** 2 - polygamma(1, freedom / 2))
+        excess = (MAD * np.median(np.abs(z - middle))) ** 2 - polygamma(1, freedom / 2)
+        half = _MAX_HALF_FREEDOM
+        if not excess < 1 / _MAX_HALF_FREEDOM:  # trigamma(half) = excess, by Newton steps (Smyth, appendix)
+            half = 0.5 + 1 / excess
+            for _ in range(10):
+                half += polygamma(1, half) * (1 - polygamma(1, half) / excess) / polygamma(2, half)
+            half = float(half)
         prior_freedom, prior = 2 * half, np.exp(middle + digamma(half) - np.log(half))
     moderated = (prior_freedom * prior + freedom * ratio) / (prior_freedom + freedom)
     strange = ratio > prior * fdtri(freedom, prior_freedom, 1 - FAMILY / max(len(ratio), 1))
@@ -149,16 +155,6 @@ def moderate(ratio: FloatArray, sound: BoolArray, freedom: float) -> tuple[Float
 def damping_of(k: IntArray, softness: FloatArray | float) -> FloatArray:
     """Return the part of the power of these harmonics that remains in outlines with soft edges."""
     return np.asarray(np.exp(-((k * softness) ** 2)))
-
-
-def _inverse_trigamma(value: float) -> float:
-    """Return y with trigamma(y) = value, by Newton steps (Smyth 2004, appendix)."""
-    if value < 1 / _MAX_HALF_FREEDOM:
-        return _MAX_HALF_FREEDOM
-    y = 0.5 + 1 / value
-    for _ in range(10):
-        y += polygamma(1, y) * (1 - polygamma(1, y) / value) / polygamma(2, y)
-    return float(y)
 
 
 def rise_to_first(h: FloatArray, weight: FloatArray, softness: float) -> float:
