@@ -173,10 +173,16 @@ class MultifrontalSolver:
                 F = self._front(equations, front, added, space)
                 for child in front.children:  # in this order for any number of threads
                     _extend(left.pop(child), fronts[child].into, F)
-                done = _eliminate_pivots(F, 6 * front.pivots)
-                if done is None:
+                pivots = 6 * front.pivots
+                U, info = dpotrf(F[:pivots, :pivots].T.copy(order="F"), lower=0, clean=1, overwrite_a=1)
+                if info != 0:
                     return False
-                eliminated[g], left[g] = done
+                rest = F[pivots:, pivots:].copy()
+                K = F[pivots:, :pivots].copy()
+                if len(K):
+                    K = dtrsm(1.0, U, K.T, trans_a=1, overwrite_b=1).T
+                    rest = dsyrk(-1.0, K.T, beta=1.0, c=rest.T, trans=1, overwrite_c=1).T
+                eliminated[g], left[g] = EliminatedFront(U.T, K, float(np.diagonal(U).min())), rest
             return True
 
         half, end = self.fronts.halves
@@ -198,19 +204,6 @@ class MultifrontalSolver:
         each = np.arange(6 * front.pivots)
         F[each, each] += equations.damping + added[front.rows[each]]  # the scaled diagonal of U is 1
         return F
-
-
-def _eliminate_pivots(F: FloatArray, pivots: int) -> tuple[EliminatedFront, FloatArray] | None:
-    """Return the factor of the first unknowns of a front, and the remainder of the front."""
-    U, info = dpotrf(F[:pivots, :pivots].T.copy(order="F"), lower=0, clean=1, overwrite_a=1)
-    if info != 0:
-        return None
-    rest = F[pivots:, pivots:].copy()
-    K = F[pivots:, :pivots].copy()
-    if len(K):
-        K = dtrsm(1.0, U, K.T, trans_a=1, overwrite_b=1).T
-        rest = dsyrk(-1.0, K.T, beta=1.0, c=rest.T, trans=1, overwrite_c=1).T
-    return EliminatedFront(U.T, K, float(np.diagonal(U).min())), rest
 
 
 def _separating_rows(vectors: FloatArray) -> IntArray:
