@@ -191,7 +191,12 @@ def _correlation_of(
         return None
     o = m.layout.observations
     size = max(max(camera.size_px) for camera in adjustment.estimate.cameras)
-    cells = [_cells(o.image, o.xy, used, size / 2.0**n) for n in range(1, HALVINGS + 1)]
+    cells = []  # which image points are in each nonempty cell of the photographs, sparse, (cells, k)
+    for n in range(1, HALVINGS + 1):
+        of_cell = np.column_stack([o.image, np.floor(o.xy / (size / 2.0**n))])[used]
+        cell = np.unique(of_cell, axis=0, return_inverse=True)[1].ravel()
+        ones, place = np.ones(len(cell)), (cell, np.flatnonzero(used))
+        cells.append(csr_matrix((ones, place), shape=(cell.max() + 1, len(used))))
     v = linear.whitening @ adjustment.residuals[m.layout.order][:, :, None]
     v[~used] = 0.0
     squares = _squares(v, cells)
@@ -272,13 +277,6 @@ def with_neighbours(adjustment: Adjustment) -> Adjustment:
     """
     correlation = estimate_error_correlation(adjustment)
     return adjustment if correlation is None else with_error_correlation(adjustment, correlation)
-
-
-def _cells(image: IntArray, xy: FloatArray, used: BoolArray, side_px: float) -> csr_matrix:
-    """Return which image points are in each nonempty cell of the photographs, sparse, (cells, k)."""
-    of_cell = np.column_stack([image, np.floor(xy / side_px)])[used]
-    cell = np.unique(of_cell, axis=0, return_inverse=True)[1].ravel()
-    return csr_matrix((np.ones(len(cell)), (cell, np.flatnonzero(used))), shape=(cell.max() + 1, len(used)))
 
 
 def _squares(v: FloatArray, cells: list[csr_matrix]) -> FloatArray:

@@ -17,7 +17,7 @@ import numpy as np
 
 from sfm.adjustment.result import MIN_SIGMA_PX, Adjustment
 from sfm.model.camera import camera_families
-from sfm.model.conventions import BoolArray, FloatArray, IntArray
+from sfm.model.conventions import FloatArray, IntArray
 
 LAST_CHANGE = 1e-3  # relative change of a variance component at which the estimation ends
 LAST_CHANGE_OF_PARTS = 0.01  # the same for a covariance of two parts, and for the share of one part
@@ -188,9 +188,16 @@ def estimate_components(
             return adjustment, factor, True
         missing.append(np.log(sigma0))
         factor = np.maximum(factor * np.exp(_secant_steps(np.log(tried), missing)), least)
-        first = _cycle_start(tried, rejected, factor)
-        if first is not None:
-            chosen = min(range(first, len(tried)), key=lambda at: int(rejected[at].sum()))
+        # All rounds start from the same values, so the same factors lead to the same adjustments again: a
+        # cycle, if other image points were rejected meanwhile.
+        again = [
+            at
+            for at in range(len(tried))
+            if np.abs(factor / tried[at] - 1).max() <= LAST_CHANGE
+            and not all(np.array_equal(rejected[at], later) for later in rejected[at + 1 :])
+        ]
+        if again:
+            chosen = min(range(again[-1], len(tried)), key=lambda at: int(rejected[at].sum()))
             if chosen < len(tried) - 1:
                 adjustment = adjust_with(tried[chosen][group])
             return adjustment, tried[chosen], False
@@ -267,15 +274,3 @@ def _median_trace(squares: FloatArray, parts: FloatArray) -> float:
     """Return the median variance of an image coordinate, px^2."""
     C = np.einsum("p,pkab->kab", squares, parts)
     return float(np.median(np.trace(C, axis1=1, axis2=2))) / 2
-
-
-def _cycle_start(tried: list[FloatArray], rejected: list[BoolArray], factor: FloatArray) -> int | None:
-    """Return the round with the same factors, after which other image points were rejected; None if none.
-
-    All rounds start from the same values, so the same factors lead to the same adjustments again.
-    """
-    for at in reversed(range(len(tried))):
-        others = any(not np.array_equal(rejected[at], later) for later in rejected[at + 1 :])
-        if others and np.abs(factor / tried[at] - 1).max() <= LAST_CHANGE:
-            return at
-    return None

@@ -245,7 +245,17 @@ def _split(graph: csr_matrix) -> tuple[BoolArray, BoolArray, BoolArray] | None:
     m = graph.shape[0]
     rows, columns = np.repeat(np.arange(m), np.diff(graph.indptr)), graph.indices
     best: tuple[BoolArray, BoolArray, BoolArray] | None = None
-    for way in _directions(graph).T:
+    # four coordinates by which photographs can be ordered, (m, 4)
+    indptr, indices = graph.indptr.astype(np.int64), graph.indices.astype(np.int64)
+    a = distances(indptr, indices, int(distances(indptr, indices, 0).argmax()))
+    b = distances(indptr, indices, int(a.argmax()))
+    c = distances(indptr, indices, int(np.minimum(a, b).argmax()))
+    d = distances(indptr, indices, int(c.argmax()))
+    ways = np.stack([a - b, c - d, a + c - b - d, a + d - b - c], axis=1).astype(float)
+    joined = csr_matrix((np.ones(len(indices)), indices, indptr), shape=graph.shape)
+    for _ in range(SMOOTHED):
+        ways = (joined @ ways) / np.maximum(np.diff(indptr), 1)[:, None]
+    for way in ways.T:
         first = np.zeros(m, dtype=bool)
         first[np.argsort(way, kind="stable")[: m // 2]] = True
         cut = first[rows] & ~first[columns]
@@ -257,20 +267,6 @@ def _split(graph: csr_matrix) -> tuple[BoolArray, BoolArray, BoolArray] | None:
     if best is None or best[2].sum() > MAX_SEPARATOR * m or not (best[0].any() and best[1].any()):
         return None
     return best
-
-
-def _directions(graph: csr_matrix) -> FloatArray:
-    """Return four coordinates by which photographs can be ordered, (m, 4)."""
-    indptr, indices = graph.indptr.astype(np.int64), graph.indices.astype(np.int64)
-    a = distances(indptr, indices, int(distances(indptr, indices, 0).argmax()))
-    b = distances(indptr, indices, int(a.argmax()))
-    c = distances(indptr, indices, int(np.minimum(a, b).argmax()))
-    d = distances(indptr, indices, int(c.argmax()))
-    ways = np.stack([a - b, c - d, a + c - b - d, a + d - b - c], axis=1).astype(float)
-    joined = csr_matrix((np.ones(len(indices)), indices, indptr), shape=graph.shape)
-    for _ in range(SMOOTHED):
-        ways = (joined @ ways) / np.maximum(np.diff(indptr), 1)[:, None]
-    return ways
 
 
 @compiled
