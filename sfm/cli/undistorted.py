@@ -177,10 +177,14 @@ def owners(file: CameraFile, names: Sequence[str]) -> list[int]:
         parts = sorted(set(proposed.camera.values()))
         if len(parts) == len(file.cameras):
             order = {part: k for k, part in enumerate(parts)}
+    whole = []  # what finds the name of each camera where no further letter or digit of its kind continues it
+    for camera in file.cameras:
+        ends = [r"\d" if end.isdigit() else r"[^\W\d_]" for end in (camera.name[0], camera.name[-1])]
+        whole.append(re.compile(f"(?<!{ends[0]}){re.escape(camera.name)}(?!{ends[1]})"))
     of: list[int] = []
     for name in names:
         stem = _stem(name)
-        named = [k for k, camera in enumerate(file.cameras) if _whole(camera.name).search(stem)]
+        named = [k for k, pattern in enumerate(whole) if pattern.search(stem)]
         if stem in known:
             of.append(known[stem])
         elif len(named) == 1:
@@ -194,12 +198,6 @@ def owners(file: CameraFile, names: Sequence[str]) -> list[int]:
                 "the name of the camera into that of the photograph"
             )
     return of
-
-
-def _whole(name: str) -> re.Pattern[str]:
-    """Return what finds a name where no further letter or digit of its kind continues it."""
-    ends = [r"\d" if end.isdigit() else r"[^\W\d_]" for end in (name[0], name[-1])]
-    return re.compile(f"(?<!{ends[0]}){re.escape(name)}(?!{ends[1]})")
 
 
 def _moments(file: CameraFile, names: Sequence[str]) -> dict[str, Moment]:

@@ -20,7 +20,7 @@ from __future__ import annotations
 
 import math
 import re
-from collections.abc import Iterable, Mapping
+from collections.abc import Mapping
 from dataclasses import dataclass, field
 from typing import Literal
 
@@ -243,20 +243,6 @@ def _readable(numbers: Mapping[str, Quantity]) -> dict[str, Quantity]:
     return shown
 
 
-def _digits(number: Quantity, parts: Iterable[tuple[str, ...] | Quantity]) -> int:
-    """Return how many significant digits distinguish a number from all others of its unit in a sentence."""
-    others = [
-        part.value
-        for part in parts
-        if isinstance(part, Quantity) and part.unit == number.unit != "" and part.value != number.value
-    ]
-
-    def distinguished(digits: int) -> bool:
-        return significant(number.value, digits) not in {significant(other, digits) for other in others}
-
-    return next((digits for digits in range(DIGITS, MAX_DIGITS) if distinguished(digits)), MAX_DIGITS)
-
-
 def _written(parts: Mapping[str, tuple[str, ...] | Quantity], name: str, spec: str) -> str:
     """Format one part as the specification of its field asks."""
     part = parts[name]
@@ -270,7 +256,18 @@ def _written(parts: Mapping[str, tuple[str, ...] | Quantity], name: str, spec: s
     if not isinstance(part, Quantity):
         names = part if spec in ("", "@all") else _nouns(part, spec[1:])
         return listed(names, most=len(names) if spec == "@all" else MAX_LISTED)
-    return _number(part, spec, _digits(part, parts.values()))
+    others = [
+        other.value
+        for other in parts.values()
+        if isinstance(other, Quantity) and other.unit == part.unit != "" and other.value != part.value
+    ]
+    # as many significant digits as distinguish it from all others of its unit in the sentence
+    digits = DIGITS
+    while digits < MAX_DIGITS and significant(part.value, digits) in {
+        significant(other, digits) for other in others
+    }:
+        digits += 1
+    return _number(part, spec, digits)
 
 
 def _nouns(names: tuple[str, ...], other: str) -> list[str]:

@@ -118,6 +118,13 @@ def follow_camera(video: Video, progress: Progress = SILENT) -> Way:
         PhotographError: no frame can be decoded.
     """
     tracker, way, sharpness = _Tracker(), list[float](), list[float]()
+
+    def power(picture: AnyArray) -> float:
+        """Return the power of gradients from pixel to pixel."""
+        down = cv2.norm(picture[1:], picture[:-1], cv2.NORM_L2SQR)
+        across = cv2.norm(picture[:, 1:], picture[:, :-1], cv2.NORM_L2SQR)
+        return (down + across) / picture.size
+
     for frame in video.frames():
         grey = frame.grey()
         factor = min(1.0, TRACKED_SIDE_PX / max(grey.shape))
@@ -125,7 +132,8 @@ def follow_camera(video: Video, progress: Progress = SILENT) -> Way:
         small = np.asarray(cv2.resize(grey, size, interpolation=cv2.INTER_AREA))
         tracker.add(small)
         way.append(tracker.way)
-        sharpness.append(_sharpness(grey))
+        coarse = cv2.resize(grey, None, fx=0.25, fy=0.25, interpolation=cv2.INTER_AREA)
+        sharpness.append(power(grey) / max(power(np.asarray(coarse)), 1e-6))
         progress.advance(f"{frame.time_s:.1f} s")
     return Way(np.array(video.times_s), np.array(way), np.array(sharpness), tracker.has_points)
 
@@ -238,18 +246,6 @@ def _angle(start: AnyArray, now: AnyArray, side_px: int) -> float:
     size = np.quantile(np.linalg.norm(start - np.median(start, axis=0), axis=1), LARGER)
     figure = np.quantile(np.linalg.norm(moved - shift, axis=1), LARGER) / max(float(size), 1.0)
     return float(np.hypot(np.linalg.norm(shift) / (FOCAL_PER_SIDE * side_px), figure))
-
-
-def _sharpness(grey: AnyArray) -> float:
-    """Return the power of gradients from pixel to pixel over that from two pixels to two."""
-
-    def power(picture: AnyArray) -> float:
-        down = cv2.norm(picture[1:], picture[:-1], cv2.NORM_L2SQR)
-        across = cv2.norm(picture[:, 1:], picture[:, :-1], cv2.NORM_L2SQR)
-        return (down + across) / picture.size
-
-    coarse = cv2.resize(grey, None, fx=0.25, fy=0.25, interpolation=cv2.INTER_AREA)
-    return power(grey) / max(power(np.asarray(coarse)), 1e-6)
 
 
 @dataclass(frozen=True)
