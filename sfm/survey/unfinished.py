@@ -90,7 +90,12 @@ def unfinished_survey(
     if matched is not None:
         network, estimate = matched.network, matched.estimate
         overlays = overlays if matched.overlays is None else matched.overlays
-    reasons = _reasons_of(error) if start is None else start.failures
+    reasons: Sequence[tuple[str, Remark]] = () if start is None else start.failures
+    cause: BaseException | None = error if start is None else None  # that states what could not be oriented
+    while cause is not None and not isinstance(cause, NotOrientedError):
+        cause = cause.__cause__
+    if cause is not None:
+        reasons = cause.failures
     left_out = () if matched is None else matched.left_out
     remarks = (() if start is None else start.remarks) + (() if matched is None else matched.remarks)
     contradicting = (*measured.left_out, *(() if matched is None else matched.left_out_image_points))
@@ -117,12 +122,3 @@ def unfinished_survey(
         ),
         settings=settings_by_table(survey),
     )
-
-
-def _reasons_of(error: BaseException | None) -> Sequence[tuple[str, Remark]]:
-    """Return the photographs that could not be oriented, with the reasons, as far as an error states them."""
-    while error is not None:
-        if isinstance(error, NotOrientedError):
-            return error.failures
-        error = error.__cause__
-    return ()

@@ -61,7 +61,6 @@ from sfm.survey.adjusting.solution_remarks import (
 from sfm.survey.free_parameters import choose_free_parameters
 from sfm.survey.inputs.calibration import is_plate_control, plate_control, plate_family
 from sfm.survey.inputs.cameras import split_cameras
-from sfm.survey.inputs.settings import CameraSettings
 from sfm.survey.inputs.start import given_values, with_given_mounts
 from sfm.survey.inputs.survey import Survey
 from sfm.survey.placing import (
@@ -253,11 +252,12 @@ def _prepare(survey: Survey, matched: Correspondences, varying: frozenset[str]) 
     chosen = choose_free_parameters(
         survey, network.with_given(ScaleBars(), further=()), estimate, datum=datum
     )
-    cameras = tuple(
-        _with_c_per_photograph(settings) if settings.name in varying else settings
-        for settings in chosen.cameras
-    )
-    survey, estimate = replace(survey, cameras=cameras), chosen.estimate
+    cameras = []
+    for settings in chosen.cameras:
+        focal = MODELS[settings.model].names_of(Role.FOCAL)
+        varies = settings.name in varying and set(focal) <= set(settings.free)  # c per photograph
+        cameras.append(settings.model_copy(update={"per_photograph": focal}) if varies else settings)
+    survey, estimate = replace(survey, cameras=tuple(cameras)), chosen.estimate
     network, estimate = split_cameras(survey.cameras, network, estimate, survey.start_cameras)
     network, estimate = split_blocks(survey, network, estimate)
     # how many image points each photograph needs: those of a source that gives it enough
@@ -278,15 +278,6 @@ def _prepare(survey: Survey, matched: Correspondences, varying: frozenset[str]) 
         (*unused, *chosen.remarks),
         chosen.accepted if survey.reject == "tau" else None,
     )
-
-
-def _with_c_per_photograph(settings: CameraSettings) -> CameraSettings:
-    """Return the settings with c per photograph, if it is adjusted."""
-    parameters = MODELS[settings.model].parameters
-    focal = tuple(parameter.name for parameter in parameters if parameter.role is Role.FOCAL)
-    if not set(focal) <= set(settings.free):
-        return settings
-    return settings.model_copy(update={"per_photograph": focal})
 
 
 def _free_network(start: _Prepared) -> StableAdjustment | None:
@@ -425,13 +416,6 @@ def _finish_from_best_start(start: _Prepared, settled: StableAdjustment) -> _Fin
     return choose(_finish(start, settled), (BETTER_START,), settle_again)
 
 
-def _gain_of_start(before: _Final, again: _Final) -> float:
-    """Return the gain of ln likelihood of all image points; both have the same parameters."""
-    if not again.adjustment.converged:
-        return -np.inf
-    return again.log_likelihood - before.log_likelihood
-
-
 def _report_start(before: _Final, again: _Final) -> _Final:
     """Return the final adjustment with the remark on its start, a solution of smaller v'Pv."""
     other, cameras = before.others[0], before.adjustment.estimate.cameras
@@ -448,7 +432,9 @@ def _report_start(before: _Final, again: _Final) -> _Final:
 
 BETTER_START = Choice[_Final, _Final](  # of a final adjustment that has another solution to start from
     lambda final: [final] if final.others and final.others[0].converges else [],
-    _gain_of_start,
+    lambda before, again: (  # the gain of ln likelihood of all image points; both have the same parameters
+        again.log_likelihood - before.log_likelihood if again.adjustment.converged else -np.inf
+    ),
     report=_report_start,
 )
 
