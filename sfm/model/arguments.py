@@ -162,8 +162,8 @@ def _checked(where: str, value: object, allowed: tuple[Any, ...]) -> object:
                 return made if dtype is None else made.astype(dtype, copy=False)
         elif _fits(value, hint):
             origin, inner = typing.get_origin(hint), typing.get_args(hint)
-            holds_arrays = origin in SEQUENCES and any(row[0] == inner[0] for row in ARRAYS)
-            if isinstance(value, list | tuple) and holds_arrays:
+            of_arrays = origin in SEQUENCES and any(row[0] == inner[0] for row in ARRAYS)
+            if of_arrays and isinstance(value, list | tuple):
                 value = [_checked("", element, inner[:1]) for element in value]
             return origin(value) if origin in (list, tuple) else value
     expected = " or ".join(dict.fromkeys(_type_name(hint) for hint in allowed))

@@ -120,9 +120,8 @@ def _of_motions(network: Network, estimate: Estimate) -> list[Weighted]:
                 on[:] = False  # of mounts and cameras, which motions do not change
             else:
                 on &= (estimate.determined if of == POINT else estimate.oriented)[at]
-        if on.any():
-            usable.append(kind.select(on))
-    return usable
+        usable.append(kind.select(on))
+    return [kind for kind in usable if len(kind)]
 
 
 def _fitted(

@@ -80,6 +80,9 @@ def name_photographs(survey: Survey, files: PhotographList) -> NamedPhotographs:
     named = with_each_table(survey, lambda table: replace(table, image=tuple(map(name_of, table.image))))
     given = given_tables(named)
     without_file = dict.fromkeys(name for table in given for name in table.image if name not in known)
+    of_survey = with_each_table(named, lambda table: _of_survey(table, survey, files))
+    exterior = _renamed(survey.exterior, name_of)
+    orientations = _renamed(survey.start_orientations, name_of)
     moments: dict[str, str] = {}
     for text, moment in survey.moments.items():
         name = name_of(text)
@@ -89,12 +92,12 @@ def name_photographs(survey: Survey, files: PhotographList) -> NamedPhotographs:
                 f"{survey.source}: photograph '{name}' has the moments '{before}' and '{moment}', needed one"
             )
     survey = replace(
-        with_each_table(named, lambda table: _of_survey(table, survey, files)),
+        of_survey,
         marks=marks,
         refused=tuple(replace(mark, photograph=name_of(mark.photograph)) for mark in survey.refused),
         marked_hashes={name_of(name): value for name, value in survey.marked_hashes.items()},
-        exterior=_renamed(survey.exterior, name_of),
-        start_orientations=_renamed(survey.start_orientations, name_of),
+        exterior=exterior,
+        start_orientations=orientations,
         moments=moments,
     )
     if not without_file:
