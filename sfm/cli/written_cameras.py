@@ -64,9 +64,8 @@ def write_camera_files(
     file, conversions = readjust_cameras(file, form.stored, form.forms)
     refuse_inexact(conversions, inexact=inexact)
     lines = [conversion.words for conversion in conversions]
-    if (
-        file.mounts is not None and max(map(len, file.mounts.by_rig().values()), default=0) > 1
-    ):  # written whole
+    of_rigs = {} if file.mounts is None else file.mounts.by_rig()
+    if max(map(len, of_rigs.values()), default=0) > 1:  # a rig is written whole
         if not form.mounted(file):
             lines.append(f"{form.name} does not store how these cameras are mounted, as {KALIBR} does")
         elif form.name == KALIBR and file.unit not in METRES:

@@ -15,7 +15,6 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass, replace
-from functools import partial
 
 import numpy as np
 
@@ -47,11 +46,14 @@ class Kind:
         return len(self.moves) + len(self.form)
 
 
-def _straight(axes: slice, y: FloatArray, q: FloatArray) -> Distances:
-    """Return the distances along some axes: those across a line, or that off a plane."""
-    normal = np.eye(3)[axes]
-    g = np.broadcast_to(normal, (len(y), *normal.shape))
-    return y[:, axes], g, np.zeros((len(y), len(normal), 0))
+def _line(y: FloatArray, q: FloatArray) -> Distances:
+    g = np.broadcast_to(np.eye(3)[:2], (len(y), 2, 3))
+    return y[:, :2], g, np.zeros((len(y), 2, 0))
+
+
+def _plane(y: FloatArray, q: FloatArray) -> Distances:
+    g = np.broadcast_to(np.eye(3)[2:], (len(y), 1, 3))
+    return y[:, 2:], g, np.zeros((len(y), 1, 0))
 
 
 def _radial(y: FloatArray) -> tuple[FloatArray, FloatArray]:
@@ -177,8 +179,8 @@ SHIFTS, TILTS = (0, 1, 2), (3, 4)
 KINDS = {
     kind.name: kind
     for kind in (
-        Kind("line", "point", (), (0, 1, *TILTS), 2, 2, partial(_straight, slice(0, 2))),
-        Kind("plane", "point", (), (2, *TILTS), 1, 3, partial(_straight, slice(2, 3))),
+        Kind("line", "point", (), (0, 1, *TILTS), 2, 2, _line),
+        Kind("plane", "point", (), (2, *TILTS), 1, 3, _plane),
         Kind("circle", "centre", ("radius",), (*SHIFTS, *TILTS), 2, 3, _circle),
         Kind("ellipse", "centre", ("semi_major", "semi_minor"), (*SHIFTS, *TILTS, 5), 2, 5, _ellipse),
         Kind("sphere", "centre", ("radius",), SHIFTS, 1, 4, _sphere),
