@@ -26,7 +26,7 @@ from sfm.model.camera import (
 )
 from sfm.model.conventions import BoolArray, FloatArray
 from sfm.model.display import counted
-from sfm.model.distortion.models import CONVERTIBLE, MODELS, Model, Role
+from sfm.model.distortion.models import CONVERTIBLE, MODELS, Role
 from sfm.model.errors import GeometryError, SurveyFileError
 from sfm.model.estimate import Estimate
 from sfm.model.network import Network, rows_of
@@ -280,21 +280,18 @@ def corresponding_free(camera: Camera, model: str) -> BoolArray:
     free = {
         parameter.role for parameter, is_free in zip(source.parameters, camera.free, strict=True) if is_free
     }
-    return np.array(
-        [bool(free & _counterparts(parameter.role, source, target)) for parameter in target.parameters]
-    )
-
-
-def _counterparts(role: Role, source: Model, target: Model) -> set[Role]:
-    """Return the roles in the source model that correspond to a role in the target model."""
     radial = {Role.RADIAL, Role.DENOMINATOR}
-    if role in radial:
-        return radial
-    if role is Role.FOCAL and not target.names_of(Role.AFFINITY):
-        return {Role.FOCAL, Role.AFFINITY}
-    if role is Role.AFFINITY and not source.names_of(Role.AFFINITY):
-        return {Role.FOCAL}
-    return {role}
+    corresponding = []
+    for parameter in target.parameters:
+        role, counterparts = parameter.role, {parameter.role}
+        if role in radial:
+            counterparts = radial
+        elif role is Role.FOCAL and not target.names_of(Role.AFFINITY):
+            counterparts = {Role.FOCAL, Role.AFFINITY}
+        elif role is Role.AFFINITY and not source.names_of(Role.AFFINITY):
+            counterparts = {Role.FOCAL}
+        corresponding.append(bool(free & counterparts))
+    return np.array(corresponding)
 
 
 def _reversed_series(a: float, b: float, c: float) -> tuple[float, float, float]:

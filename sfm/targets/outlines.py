@@ -89,13 +89,20 @@ def find_outlines(
     # Outlines need no more than 8 bits; the measurement uses all bits.
     image = as_bytes(photograph, scale)
     step = 255 / scale * max(STEP_SIGMAS * SMOOTHED_NOISE * noise, MIN_STEP * scale)
-    mean, band = _local_mean(image), np.empty_like(image)
+    # the mean intensity around each pixel of every fourth row, (H // 4, W)
+    height, width = image.shape
+    rows, columns = max(1, height // CELL_PX), max(1, width // CELL_PX)
+    half = cv2.resize(image, (2 * columns, 2 * rows), interpolation=cv2.INTER_AREA)
+    cells = cv2.resize(half, (columns, rows), interpolation=cv2.INTER_AREA)
+    cells = cv2.blur(cells, (MEAN_CELLS, MEAN_CELLS))
+    mean = cv2.resize(cells, (width, rows), interpolation=cv2.INTER_LINEAR)
+    band = np.empty_like(image)
     ellipses, kept_signs, rejected_xy, rejected_flag = [], [], [], []
     for sign in signs:
         _mark_band(image, mean, step, sign, band)
         points, first = _trace_contours(band)
         ellipse, reason = _ellipses_of_contours(
-            points, first, image.shape[0], image.shape[1], float(min_diameter_px), float(max_diameter_px)
+            points, first, height, width, float(min_diameter_px), float(max_diameter_px)
         )
         shown = _reaching_shown(ellipse, hidden, reach)
         _bridge_damage(points, first, ellipse, reason, shown)
@@ -156,16 +163,6 @@ def scale_of(photograph: AnyArray) -> float:
     if photograph.dtype == np.uint8:
         return 255.0
     return float((1 << max(8, int(photograph.max()).bit_length())) - 1)
-
-
-def _local_mean(image: AnyArray) -> AnyArray:
-    """Return the mean intensity around each pixel of every fourth row, shape (H // 4, W), uint8."""
-    height, width = image.shape
-    rows, columns = max(1, height // CELL_PX), max(1, width // CELL_PX)
-    half = cv2.resize(image, (2 * columns, 2 * rows), interpolation=cv2.INTER_AREA)
-    cells = cv2.resize(half, (columns, rows), interpolation=cv2.INTER_AREA)
-    cells = cv2.blur(cells, (MEAN_CELLS, MEAN_CELLS))
-    return cv2.resize(cells, (width, rows), interpolation=cv2.INTER_LINEAR)
 
 
 @compiled
