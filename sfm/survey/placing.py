@@ -66,7 +66,14 @@ def place_on_observations(network: Network, estimate: Estimate) -> Estimate:
     start, rows, rounding = _about_centre(kinds, estimate)
     scaled = not has_held_mounts(estimate)
     turns = np.abs(rows[:, 3:6]).max() > rounding
-    attitudes = _attitudes() if turns else [np.eye(3)]  # undetermined by distances and frames
+    attitudes = [np.eye(3)]  # undetermined by distances and frames
+    if turns:  # the 24 rotations of a cube
+        attitudes = []
+        for order, signs in product(permutations(range(3)), product((1.0, -1.0), repeat=3)):
+            R = np.zeros((3, 3))
+            R[np.arange(3), list(order)] = signs
+            if np.linalg.det(R) > 0:
+                attitudes.append(R)
     turned = [Similarity(1.0, R, np.zeros(3)).apply_estimate(start) for R in attitudes]
     tried = [_fitted(kinds, candidate, ROUGH_ROUNDS, scaled=scaled) for candidate in turned]
     best = sorted(tried, key=lambda fit: fit[1])[:BEST]
@@ -172,18 +179,6 @@ def _rows(kinds: Sequence[Kind], estimate: Estimate) -> tuple[FloatArray, FloatA
         rows.append((F @ J).reshape(-1, 7))
         differences.append(np.einsum("nab,nb->na", F, linear.difference).ravel())
     return np.concatenate(rows), np.concatenate(differences)
-
-
-def _attitudes() -> list[FloatArray]:
-    """Return the 24 rotations of a cube."""
-    rotations = []
-    for order in permutations(range(3)):
-        for signs in product((1.0, -1.0), repeat=3):
-            R = np.zeros((3, 3))
-            R[np.arange(3), list(order)] = signs
-            if np.linalg.det(R) > 0:
-                rotations.append(R)
-    return rotations
 
 
 def place_on_exterior(network: Network, estimate: Estimate) -> Estimate:
