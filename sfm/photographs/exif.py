@@ -131,7 +131,7 @@ def read_metadata(path: str | Path) -> Metadata:
             several = bool(getattr(image, "n_frames", 1) > 1)
         elif isinstance(image, Image.Image) and image.format in ("TIFF", "MPO"):
             first = image.size
-            with suppress(Exception):  # there is no second one, or it is damaged
+            with suppress(Exception):  # there is none, or it is damaged
                 image.seek(1)
                 several = image.size == first
     focal = _between(camera.get(ExifTags.Base.FocalLength), FOCAL_MM)
