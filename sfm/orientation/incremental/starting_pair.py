@@ -3,11 +3,15 @@
 Pairs with many common points are oriented relatively. Each of their solutions becomes a model. The other
 photographs are resected on it, and the model that fits most image points is the start. If there is no third
 photograph to distinguish the two solutions of a plane, other knowledge decides.
+
+Rays that intersect at wide angles withstand unknown distortion. Photographs along the optical axis have few
+of them. There, false planes that fit within the wide tolerance have wide angles. If the rays of the best pair
+favour another solution, pairs with angles that are large for the precision of their rays are tried too.
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, replace
 
@@ -33,6 +37,7 @@ AS_A_PLANE = 0.1  # tangents; largest displacement of points from a plane by the
 PAIR_POINTS = 1000  # common points of a pair that take part in its orientation
 MIN_MEDIAN_ANGLE_DEG = 5.0  # smallest median ray angle of a useful starting pair
 MIN_ANGLE_OF_TWO_DEG = 3.0  # the same in a survey of two photographs, which has no other pair
+MIN_PARALLAX = 10.0  # median ray angle in standard deviations; below it a depth is known to a tenth at best
 TWOFOLD = 2.0  # ratio of two misfits above which the smaller one is correct
 SCREEN_TRIALS = 200  # triples per photograph in the comparison of solutions
 SCREEN_POINTS = 30  # points per photograph in the comparison
@@ -52,6 +57,32 @@ class Start:
 
 
 Judge = Callable[[Start], float]
+
+
+@dataclass(frozen=True)
+class _Model:
+    """One solution of one pair, with the points that it determines."""
+
+    pair: tuple[int, int]
+    solution: RelativeOrientation
+    favoured: bool  # whether it has the kind that the conjugate rays favour
+    points: IntArray  # common points of the pair, (k,)
+    xyz: FloatArray  # in the frame of the first photograph, NaN where they do not fit, (k, 3)
+    angle: float  # median angle of the rays, rad
+
+    @property
+    def shows_depths(self) -> bool:
+        """Whether the rays favour it and intersect at large angles for the precision that they show."""
+        return self.favoured and self.angle >= MIN_PARALLAX * self.solution.rms
+
+    def start(self, network: Network) -> Start:
+        """Return the model as the start of a network."""
+        m, n, (i, j) = len(network.images), len(network.points), self.pair
+        position, rotation, xyz = np.full((m, 3), np.nan), np.full((m, 3, 3), np.nan), np.full((n, 3), np.nan)
+        position[i], rotation[i] = 0.0, np.eye(3)
+        position[j], rotation[j] = self.solution.base, self.solution.rotation
+        xyz[self.points] = self.xyz
+        return Start(self.pair, self.solution.kind, position, rotation, xyz)
 
 
 @dataclass(frozen=True)
@@ -96,9 +127,9 @@ def best_start(
             f"orientation: no two of the {len(network.images)} photographs have {PLANAR_POINTS} points in "
             f"common: {_list_common(network, of_photograph)}"
         )
-    candidates: list[_Candidate] = []  # candidates of the best pair
-    fits = False  # whether most points of any pair fit an orientation
-    widest, least_angle = 0.0, MIN_MEDIAN_ANGLE_DEG if len(network.images) > 2 else MIN_ANGLE_OF_TWO_DEG
+    m, fits = len(network.images), False  # whether most points of any pair fit an orientation
+    least_angle = np.radians(MIN_MEDIAN_ANGLE_DEG if m > 2 else MIN_ANGLE_OF_TWO_DEG)
+    of_pairs: list[list[_Model]] = []
     for tried, (i, j) in enumerate(pairs):
         if tried == BARREN_PAIRS and not fits:
             break
@@ -111,21 +142,33 @@ def best_start(
             )
         except GeometryError:
             continue
-        of_pair = []
-        for solution in solutions:
-            fits = fits or bool(solution.inliers.mean() > 0.5)
-            if solution.kind == "infinite":
-                continue
-            start, angle = _model(network, (i, j), points, first, second, solution)
-            widest = max(widest, angle)
-            if start is None or angle < least_angle:
-                continue
-            score, resected = _support(network, tangents, tolerance, of_photograph, start, seed)
-            of_pair.append(_Candidate(start, score, resected, solution.kind == solutions[0].kind))
-        if of_pair and (not candidates or _best_of(of_pair).score > _best_of(candidates).score):
-            candidates = of_pair
+        fits = fits or any(solution.inliers.mean() > 0.5 for solution in solutions)
+        of_pairs.append(_models((i, j), points, first, second, solutions))
+
+    def best_candidates(candidates: list[_Candidate], of_pairs: list[list[_Model]]) -> list[_Candidate]:
+        """Return the candidates of the pair with the best score, among those before and those of pairs."""
+        for models in of_pairs:
+            of_pair = []
+            for model in models:
+                start = model.start(network)
+                score, resected = _support(network, tangents, tolerance, of_photograph, start, seed)
+                of_pair.append(_Candidate(start, score, resected, model.favoured))
+            if of_pair and (not candidates or _best_of(of_pair).score > _best_of(candidates).score):
+                candidates = of_pair
+        return candidates
+
+    wide = [[model for model in models if model.angle >= least_angle] for models in of_pairs]
+    candidates = best_candidates([], wide)
+    if m > 2 and not (candidates and _best_of(candidates).favoured):
+        narrow = [
+            [model for model in models if model.angle < least_angle and model.shows_depths]
+            for models in of_pairs
+        ]
+        candidates = best_candidates(candidates, narrow)
     if not candidates:
-        seen = f": {widest:.1f} degrees at most (median), {least_angle:g} are needed" if widest > 0 else ""
+        widest = np.degrees(max((model.angle for models in of_pairs for model in models), default=0.0))
+        needed = f"{np.degrees(least_angle):g} are needed"
+        seen = f": {widest:.1f} degrees at most (median), {needed}" if widest > 0 else ""
         raise GeometryError(
             f"orientation: no pair of photographs has a base, or rays that intersect well{seen}"
         )
@@ -156,16 +199,14 @@ def pair_solutions(network: Network, estimate: Estimate, *, tolerance_px: float)
         with suppress(GeometryError):
             solutions += relative_orientations(first, second, tolerance=within, max_trials=PAIR_TRIALS)
     placed = []
-    for solution in solutions:
-        if solution.kind == "infinite":
-            continue
-        start, angle = _model(network, (0, 1), points, first, second, solution)
-        if start is None or angle < MIN_ANGLE_OF_TWO_DEG or not np.isfinite(start.points).all():
+    for model in _models((0, 1), points, first, second, solutions):
+        start = model.start(network)
+        if model.angle < np.radians(MIN_ANGLE_OF_TWO_DEG) or not np.isfinite(start.points).all():
             continue
         with suppress(GeometryError):  # points on a line do not determine it
             placing = fit_similarity(start.points, estimate.points)
-            model = replace(estimate, position=start.position, rotation=start.rotation, points=start.points)
-            placed.append(placing.apply_estimate(model))
+            pair = replace(estimate, position=start.position, rotation=start.rotation, points=start.points)
+            placed.append(placing.apply_estimate(pair))
     return tuple(placed)
 
 
@@ -266,30 +307,29 @@ def _common(
     return points, tangents[a[rows_a]], tangents[b[rows_b]]
 
 
-def _model(
-    network: Network,
+def _models(
     pair: tuple[int, int],
     points: IntArray,
     first: FloatArray,
     second: FloatArray,
-    solution: RelativeOrientation,
-) -> tuple[Start | None, float]:
-    """Return a pair with its model as a start, None if too few rays intersect, and the median angle, deg."""
-    xyz = model_points(first, second, solution)
-    usable = np.isfinite(xyz).all(axis=1)
-    if usable.sum() < PLANAR_POINTS:
-        return None, 0.0
-    to_first, to_second = xyz[usable], xyz[usable] - solution.base
-    cosine = np.sum(to_first * to_second, axis=1) / (
-        np.linalg.norm(to_first, axis=1) * np.linalg.norm(to_second, axis=1)
-    )
-    angle = float(np.degrees(np.arccos(np.clip(np.median(cosine), -1, 1))))
-    m, n = len(network.images), len(network.points)
-    position, rotation, model = np.full((m, 3), np.nan), np.full((m, 3, 3), np.nan), np.full((n, 3), np.nan)
-    position[pair[0]], rotation[pair[0]] = 0.0, np.eye(3)
-    position[pair[1]], rotation[pair[1]] = solution.base, solution.rotation
-    model[points] = xyz
-    return Start(pair, solution.kind, position, rotation, model), angle
+    solutions: Sequence[RelativeOrientation],
+) -> list[_Model]:
+    """Return the solutions of a pair with a base and enough rays that intersect, with their points."""
+    models = []
+    for solution in solutions:
+        if solution.kind == "infinite":
+            continue
+        xyz = model_points(first, second, solution)
+        usable = np.isfinite(xyz).all(axis=1)
+        if usable.sum() < PLANAR_POINTS:
+            continue
+        to_first, to_second = xyz[usable], xyz[usable] - solution.base
+        cosine = np.sum(to_first * to_second, axis=1) / (
+            np.linalg.norm(to_first, axis=1) * np.linalg.norm(to_second, axis=1)
+        )
+        angle = float(np.arccos(np.clip(np.median(cosine), -1, 1)))
+        models.append(_Model(pair, solution, solution.kind == solutions[0].kind, points, xyz, angle))
+    return models
 
 
 def _support(
