@@ -213,8 +213,9 @@ class _Search:
         if self.datum.kind != "control":
             starts.append(reverse_depth(result))
         for start in starts:
+            first = self.adjusted(start, held=steps > 0)
             for direction in (STEP, 1 / STEP) if steps else (1.0,):
-                track = self._along(start, direction, steps, vPv)
+                track = self._along(start, first, direction, steps, vPv)
                 heights = [point.vPv for point in track]
                 for k, point in enumerate(track):
                     lower = heights[k] <= min(heights[max(k - 1, 0) : k + 2])
@@ -225,29 +226,36 @@ class _Search:
                         if ended is not None and ended.converged:
                             yield _Candidate(_with_free(ended.estimate, free), ended.vPv)
 
-    def _along(self, start: Estimate, factor: float, steps: int, vPv: float) -> list[_Candidate]:
+    def _along(
+        self, start: Estimate, first: Adjustment | None, factor: float, steps: int, vPv: float
+    ) -> list[_Candidate]:
         """Follow the network with c held at multiples of its start value, while v'Pv is not too large.
 
         Each step starts from the previous one, which stays in one valley, and also from the start, which
         finds other valleys. The result with the smaller v'Pv is used.
+
+        Args:
+            start: the start values.
+            first: their adjustment.
+            factor: ratio of successive principal distances.
+            steps: number of further principal distances.
+            vPv: that of the result.
         """
         track: list[_Candidate] = []
-        estimate = start
-        for k in range(steps + 1):
-            starts = [scale_estimate(estimate, factor), scale_estimate(start, factor**k)][: min(k, 2)]
-            starts = starts or [start]
-            ended = [self.adjusted(start, held=steps > 0) for start in starts]
+        lowest = first
+        for k in range(1, steps + 2):
+            if lowest is None:
+                break
+            track.append(_Candidate(lowest.estimate, lowest.vPv))
+            if k > steps or lowest.vPv > BARRIER * vPv:
+                break
+            starts = [scale_estimate(lowest.estimate, factor), scale_estimate(start, factor**k)][: min(k, 2)]
+            ended = [self.adjusted(start, held=True) for start in starts]
             lowest = min(
                 (adjustment for adjustment in ended if adjustment is not None),
                 key=lambda adjustment: adjustment.vPv,
                 default=None,
             )
-            if lowest is None:
-                break
-            estimate = lowest.estimate
-            track.append(_Candidate(estimate, lowest.vPv))
-            if lowest.vPv > BARRIER * vPv:
-                break
         return track
 
 

@@ -201,14 +201,25 @@ def worst_photographs(residuals_px: FloatArray, image: IntArray, m: int) -> Bool
     return np.asarray(median > FAR_WORSE * np.nanmedian(median))
 
 
-def casts_doubt(first_px: FloatArray, reversed_px: FloatArray) -> bool:
+def casts_doubt(growth: Growth, reversal: Growth) -> bool:
     """Return whether the reversal of a solution in depth fits so well that either may be the true solution.
 
+    A reversal that the adjustment has turned back shows no other solution, but the way to the first one.
+
     Args:
-        first_px: lengths of the image residuals, inf where undetermined, px, (k,).
-        reversed_px: lengths of the residuals of the adjusted reversal, px, (k,).
+        growth: network with the solution.
+        reversal: its adjusted reversal.
     """
+    first_px, reversed_px = growth.residuals_px(), reversal.residuals_px()
     known = np.isfinite(first_px) & np.isfinite(reversed_px)
-    if not known.any():
+    if not known.any() or not np.median(reversed_px[known]) < DOUBTFUL * np.median(first_px[known]):
         return False
-    return bool(np.median(reversed_px[known]) < DOUBTFUL * np.median(first_px[known]))
+    seen = growth.network.image_points.select(known)
+    first, other = (
+        np.log(np.linalg.norm(estimate.points[seen.point] - estimate.position[seen.image], axis=1))
+        for estimate in (growth.estimate, reversal.estimate)
+    )
+    for rows in rows_of(seen.image, len(growth.network.images)):
+        if len(rows):
+            first[rows] -= first[rows].mean()
+    return not float(first @ other) > 0

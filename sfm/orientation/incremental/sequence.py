@@ -273,7 +273,7 @@ def _best_of_rivals(
     other_side = reversed_growth(growth, begin(values, 1.0), refine, none_dropped)
     split = growth.dropped.any() and oriented.mean() < MOST
     loose = bool((growth.tolerance_px > final_tolerance_px).any() or split)
-    if not loose and not casts_doubt(first, other_side.residuals_px()):
+    if not loose and not casts_doubt(growth, other_side):
         return growth, start
     rivals = [other_side]
     worst = worst_photographs(first, image, len(oriented))
