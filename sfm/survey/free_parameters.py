@@ -228,7 +228,12 @@ def _hold_undetermined(
 def _adjust_or_none(
     part: Network, start: Estimate, datum: str, false_alarm: float, rejected: BoolArray | None
 ) -> Adjustment | None:
-    """Adjust the free parameters; None if the adjustment fails or does not determine everything."""
+    """Adjust the free parameters; None if the adjustment fails or does not determine everything.
+
+    What the start values leave open drifts through hundreds of steps, until the rank defect ends it.
+    """
+    if _is_open(part, start, datum):
+        return None
     try:
         adjustment = adjust(
             part,
@@ -249,6 +254,28 @@ def _adjust_or_none(
     left = np.where(rays == 0, 3, np.where(rays == 1, 1, 0))
     allowed = adjustment.expected_defect + int(np.maximum(left - known, 0).sum())
     return adjustment if adjustment.converged and adjustment.defect <= allowed else None
+
+
+def _is_open(part: Network, start: Estimate, datum: str) -> bool:
+    """Return whether free parameters of the cameras add to the rank defect at the start values."""
+    defects = []
+    for values in (start, _with_free(start, [set() for _ in start.cameras])):
+        try:
+            begun = adjust(
+                part,
+                values,
+                datum=Datum(datum),
+                reject="none",
+                covariance=False,
+                options=AdjustmentOptions(max_iterations=0),
+            )
+        except (
+            GeometryError,
+            np.linalg.LinAlgError,
+        ):  # damped steps may lead to equations that can be solved
+            return False
+        defects.append(begun.defect)
+    return defects[0] > defects[1]
 
 
 def _with_free(estimate: Estimate, names: Chosen) -> Estimate:

@@ -130,7 +130,7 @@ def test_each_c_is_tried_from_the_one_before_and_from_the_start(monkeypatch: pyt
 
     monkeypatch.setattr(searched, "scale_estimate", scaled)
     search: Any = SimpleNamespace(adjusted=lambda one, held: searched._Candidate(one, next(heights)))
-    track = searched._Search._along(search, start, 2.0, 3, 1.0)
+    track = searched._Search._along(search, start, search.adjusted(start, held=True), 2.0, 3, 1.0)
     assert [one.vPv for one in track] == [1.0, 3.0, 2.0, 7.0]
     assert [one.estimate.cameras[0].parameters[0] for one in track] == [20.0, 40.0, 80.0, 160.0]
 
@@ -156,14 +156,31 @@ def test_minima_along_c_are_adjusted_and_the_start_is_not(
     start, again = stub().estimate, []
     monkeypatch.setattr(searched, "_with_free", lambda estimate, _: estimate)
 
-    def along(one: Any, factor: float, steps: int, vPv: float) -> list[Any]:
+    def along(one: Any, first: Any, factor: float, steps: int, vPv: float) -> list[Any]:
         return [searched._Candidate(one if k == 0 else stub().estimate, h) for k, h in enumerate(heights)]
 
-    def adjust_freely(one: Any) -> Any:
-        again.append(one)
+    def adjust_freely(one: Any, *, held: bool = False) -> Any:
+        if not held:
+            again.append(one)
         return SimpleNamespace(converged=True, estimate=one, vPv=2.0)
 
     search: Any = SimpleNamespace(_along=along, adjusted=adjust_freely, datum=SimpleNamespace(kind="control"))
     found = list(searched._Search.candidates(search, start, (), 1.0, 1.5, follow_c=True))
     assert len(again) == 2 * len(adjusted)  # with c larger, and smaller
-    assert [one.vPv for one in found] == 2 * ([1.0] + [2.0] * len(adjusted))
+    assert sorted(one.vPv for one in found) == 2 * [1.0] + 2 * [2.0] * len(adjusted)
+
+
+def test_no_start_is_adjusted_twice(monkeypatch: pytest.MonkeyPatch) -> None:
+    """The search leaves each start in two directions."""
+    network, truth = make_network(seed_of("weak"), images=4, points=30)
+    a = adjust(network, truth, datum=Datum("free"), reject="tau")
+    starts: list[tuple[bytes, ...]] = []
+
+    def counted(self: Any, start: Any, *, real: Any = searched._Search.adjusted, **options: Any) -> Any:
+        cameras = tuple(camera.parameters.tobytes() for camera in start.cameras)
+        starts.append((*cameras, start.position.tobytes(), start.points.tobytes(), str(options).encode()))
+        return real(self, start, **options)
+
+    monkeypatch.setattr(searched._Search, "adjusted", counted)
+    searched.other_solutions(a)
+    assert len(starts) == len(set(starts)) > searched.STEPS

@@ -9,11 +9,13 @@ import numpy as np
 import pytest
 
 from sfm.adjustment.datum import Datum
+from sfm.adjustment.result import Adjustment
 from sfm.adjustment.solve import adjust
 from sfm.model.camera import camera_from_values, project
 from sfm.model.conventions import FloatArray
 from sfm.model.estimate import Estimate
 from sfm.model.network import ImagePoints, Network, ObjectPoints
+from sfm.survey import free_parameters
 from sfm.survey.free_parameters import FreeParameters, choose_free_parameters
 from sfm.survey.inputs.cameras import split_cameras
 from sfm.survey.inputs.settings import TargetSettings
@@ -114,6 +116,28 @@ def test_on_a_plate_decentring_and_affinity_are_candidates(model: str) -> None:
 def test_what_a_network_does_not_determine_is_held() -> None:
     network, truth = planar(seed_of("parallel photographs of a plane"), 8, tilt=0.005)
     assert not {"c", "x0", "y0"} & set(chosen(network, truth).cameras[0].free)
+
+
+def test_what_start_values_leave_open_is_not_adjusted(monkeypatch: pytest.MonkeyPatch) -> None:
+    """With c free, parallel photographs of a plane drift through hundreds of steps before they fail."""
+    network, truth = planar(seed_of("parallel photographs of a plane"), 8, tilt=0.0)
+    begun = nominal(network, truth)
+    free: list[set[str]] = []
+
+    def counted(part: Network, start: Estimate, **given: Any) -> Adjustment:
+        a = adjust(part, start, **given)
+        if a.iterations:
+            camera = start.cameras[0]
+            free.append({name for name, now in zip(camera.names, camera.free, strict=True) if now})
+        return a
+
+    monkeypatch.setattr(free_parameters, "adjust", counted)
+    found = choose_free_parameters(survey_with(), network, begun)
+    assert "c" not in found.cameras[0].free and not any("c" in names for names in free)
+    free.clear()
+    convergent, truth = make_network(seed_of("free by default"), images=12, points=50)
+    found = choose_free_parameters(survey_with(), convergent, nominal(convergent, truth))
+    assert "c" in found.cameras[0].free and any("c" in names for names in free)
 
 
 @pytest.mark.parametrize("images", [1, 2])

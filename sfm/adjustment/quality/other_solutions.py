@@ -213,18 +213,19 @@ class _Search:
         if self.datum.kind != "control":
             starts.append(reverse_depth(result))
         for start in starts:
-            first = self.adjusted(start, held=steps > 0)
+            first, minima = self.adjusted(start, held=steps > 0), {}
             for direction in (STEP, 1 / STEP) if steps else (1.0,):
                 track = self._along(start, first, direction, steps, vPv)
                 heights = [point.vPv for point in track]
                 for k, point in enumerate(track):
-                    lower = heights[k] <= min(heights[max(k - 1, 0) : k + 2])
                     if point.vPv <= limit * vPv:
                         yield _Candidate(_with_free(point.estimate, free), point.vPv)
-                    if lower and (k or start is not result):
-                        ended = self.adjusted(_with_free(point.estimate, free))
-                        if ended is not None and ended.converged:
-                            yield _Candidate(_with_free(ended.estimate, free), ended.vPv)
+                    if heights[k] <= min(heights[max(k - 1, 0) : k + 2]) and (k or start is not result):
+                        minima[direction**k] = point.estimate
+            for estimate in minima.values():
+                ended = self.adjusted(_with_free(estimate, free))
+                if ended is not None and ended.converged:
+                    yield _Candidate(_with_free(ended.estimate, free), ended.vPv)
 
     def _along(
         self, start: Estimate, first: Adjustment | None, factor: float, steps: int, vPv: float
