@@ -111,7 +111,9 @@ def test_a_barrier_of_three_thousand_ends_the_search(
     search: Any = SimpleNamespace(
         adjusted=lambda start, held: SimpleNamespace(estimate=start, vPv=next(heights))
     )
-    assert len(searched._Search._along(search, stub().estimate, 1.3, 6, 1.0)) == length
+    start = stub().estimate
+    first = search.adjusted(start, held=True)
+    assert len(searched._Search._along(search, start, first, 1.3, 6, 1.0)) == length
 
 
 def test_c_is_followed_from_a_fifth_to_the_fivefold() -> None:
