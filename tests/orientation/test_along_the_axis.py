@@ -55,7 +55,7 @@ def drafted(truth: Estimate) -> Camera:
     return camera.with_parameters(parameters)
 
 
-@pytest.mark.parametrize("number", range(3))
+@pytest.mark.parametrize("number", [0, 2, 3])
 def test_the_first_solution_of_a_street_is_the_true_one(number: int, monkeypatch: pytest.MonkeyPatch) -> None:
     """It was a plane within the tolerance of the start, from which c ran to ten times itself."""
     network, truth = street(f"along the axis {number}")
