@@ -127,23 +127,9 @@ def best_start(
             f"orientation: no two of the {len(network.images)} photographs have {PLANAR_POINTS} points in "
             f"common: {_list_common(network, of_photograph)}"
         )
-    m, fits = len(network.images), False  # whether most points of any pair fit an orientation
+    m = len(network.images)
     least_angle = np.radians(MIN_MEDIAN_ANGLE_DEG if m > 2 else MIN_ANGLE_OF_TWO_DEG)
-    of_pairs: list[list[_Model]] = []
-    for tried, (i, j) in enumerate(pairs):
-        if tried == BARREN_PAIRS and not fits:
-            break
-        report_step("starting pairs tried", tried, len(pairs))
-        points, first, second = _common(network, tangents, of_photograph[i], of_photograph[j])
-        limit = float(max(tolerance[i], tolerance[j]))
-        try:
-            solutions = relative_orientations(
-                first, second, tolerance=limit, seed=seed, max_trials=PAIR_TRIALS
-            )
-        except GeometryError:
-            continue
-        fits = fits or any(solution.inliers.mean() > 0.5 for solution in solutions)
-        of_pairs.append(_models((i, j), points, first, second, solutions))
+    of_pairs = _models_of_pairs(network, tangents, tolerance, of_photograph, pairs, seed)
 
     def best_candidates(candidates: list[_Candidate], of_pairs: list[list[_Model]]) -> list[_Candidate]:
         """Return the candidates of the pair with the best score, among those before and those of pairs."""
@@ -173,6 +159,34 @@ def best_start(
             f"orientation: no pair of photographs has a base, or rays that intersect well{seen}"
         )
     return _choose(candidates, judge)
+
+
+def _models_of_pairs(
+    network: Network,
+    tangents: FloatArray,
+    tolerance: FloatArray,
+    of_photograph: list[IntArray],
+    pairs: Sequence[tuple[int, int]],
+    seed: int,
+) -> list[list[_Model]]:
+    """Return the solutions of each pair; ends after BARREN_PAIRS if most points fit in none of them."""
+    of_pairs: list[list[_Model]] = []
+    fits = False
+    for tried, (i, j) in enumerate(pairs):
+        if tried == BARREN_PAIRS and not fits:
+            break
+        report_step("starting pairs tried", tried, len(pairs))
+        points, first, second = _common(network, tangents, of_photograph[i], of_photograph[j])
+        limit = float(max(tolerance[i], tolerance[j]))
+        try:
+            solutions = relative_orientations(
+                first, second, tolerance=limit, seed=seed, max_trials=PAIR_TRIALS
+            )
+        except GeometryError:
+            continue
+        fits = fits or any(solution.inliers.mean() > 0.5 for solution in solutions)
+        of_pairs.append(_models((i, j), points, first, second, solutions))
+    return of_pairs
 
 
 def pair_solutions(network: Network, estimate: Estimate, *, tolerance_px: float) -> tuple[Estimate, ...]:
