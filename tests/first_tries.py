@@ -167,7 +167,7 @@ TRIES = (
     Try(
         "an unknown ending", "kolinear convert SURVEY x.dxf",
         lambda folder: ("convert", str(folder), str(folder / "x.dxf")), 2,
-        ("unknown ending .dxf, expected .xml, .ply, .db",),
+        ("unknown ending .dxf, expected .xml, .ply, .laz",),
     ),
     Try(
         "a distance without unit", "kolinear plan target-size --distance 3, in m",

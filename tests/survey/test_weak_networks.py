@@ -135,7 +135,7 @@ def test_another_start_is_without_the_points_that_the_final_adjustment_lost(
         return lost
 
     monkeypatch.setattr(solved_survey, "_lost_points", lost_points)
-    found = outcome_of(10800)
+    found = outcome_of(95559)
     assert {"better_solution_taken", "points_not_determined"} <= set(found.kinds) and found.over_sigma < 2
     assert len(calls) > 2 and calls[1] == calls[0] - 1
 

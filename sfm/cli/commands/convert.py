@@ -21,8 +21,8 @@ def convert(
         typer.Option(
             "--to",
             metavar="F",
-            help="Format to write.  [default: by the ending of OUT: .xml metashape, .ply ply, .db "
-            "colmap-database, .nvm nvm, .sfm alicevision, none tables]",
+            help="Format to write.  [default: by the ending of OUT: .xml metashape, .ply ply, .laz and "
+            ".las laz, .e57 e57, .db colmap-database, .nvm nvm, .sfm alicevision, none tables]",
         ),
     ] = None,
     from_format: Annotated[
@@ -55,8 +55,8 @@ def convert(
     A camera whose model the format lacks is converted to one that it has. Formats of surveys: colmap,
     colmap-text, colmap-database, tables, metashape, photomodeler, opensfm (also projects of OpenDroneMap),
     openmvg, alicevision (Meshroom), nerfstudio, bundler, nvm (VisualSFM), bal, sba, bundle-matlab,
-    bundle-csharp, rig (calibration files of rigs for OpenCV, COLMAP, DICe, MatchID, Kalibr, ROS and mrcal)
-    and ply.
+    bundle-csharp, rig (calibration files of rigs for OpenCV, COLMAP, DICe, MatchID, Kalibr, ROS and mrcal),
+    ply, and the point clouds laz and e57.
 
     Formats of cameras, to read and write: opencv-camera, ros-camera, kalibr-camera, mrcal-camera,
     colmap-camera, metashape-camera, australis-camera, nerfstudio-camera and blender-camera. A camera of a
