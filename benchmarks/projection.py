@@ -19,9 +19,7 @@ from pathlib import Path
 
 import numpy as np
 
-from benchmarks.stereo import FLIP, vector_of
-from sfm.adjustment.datum import Datum
-from sfm.adjustment.solve import AdjustmentOptions, adjust
+from benchmarks.stereo import OPTIMIZE, board_corners, calibrated, seen_from
 from sfm.model.camera import Camera, project
 from sfm.model.conventions import FloatArray, rotation_from_vector
 from sfm.model.distortion.models import MODELS
@@ -43,9 +41,9 @@ VALUES = {
 }
 DISTANCES = (500.0, 1000.0, np.inf)  # mm
 
-MRCAL = """
-import sys
-import numpy as np, mrcal
+MRCAL = (
+    OPTIMIZE
+    + """
 data = np.load(sys.argv[1])
 rows, columns = data["xy"].shape[1:3]
 inputs = dict(
@@ -57,12 +55,7 @@ inputs = dict(
     do_optimize_intrinsics_core=True, do_optimize_intrinsics_distortions=True, do_optimize_frames=True,
     do_optimize_extrinsics=True, do_optimize_calobject_warp=False, do_apply_outlier_rejection=False,
     do_apply_regularization=False, verbose=False)
-if "rt_cam_ref" not in mrcal.optimize.__doc__:  # names of version 2.2
-    inputs.update(
-        extrinsics_rt_fromref=inputs.pop("rt_cam_ref"), frames_rt_toref=inputs.pop("rt_ref_frame"),
-        points=np.zeros((0, 3)), observations_point=np.zeros((0, 3)),
-        indices_point_camintrinsics_camextrinsics=np.zeros((0, 3), dtype=np.int32))
-mrcal.optimize(**inputs)
+optimize(inputs)
 model = mrcal.cameramodel(optimization_inputs=inputs, icam_intrinsics=0)
 directions = mrcal.unproject(data["pixels"], *model.intrinsics(), normalize=True)
 covariance = [
@@ -73,13 +66,13 @@ covariance = [
     for distance in data["distances"]]
 np.savez(sys.argv[2], covariance=np.array(covariance), intrinsics=inputs["intrinsics"][0])
 """
+)
 
 
 def scene(seed: int) -> tuple[Network, Estimate]:
     """Return a network with noisy corners, and the true values."""
     rng = np.random.default_rng(seed)
-    grid = np.mgrid[0:ROWS, 0:COLUMNS].reshape(2, -1)
-    board = np.stack([PITCH * grid[1], PITCH * grid[0], np.zeros(ROWS * COLUMNS)], axis=1)
+    board = board_corners(ROWS, COLUMNS, PITCH)
     names = MODELS["opencv"].names
     free = np.array([name in VALUES for name in names])
     camera = Camera(
@@ -114,10 +107,7 @@ def with_mrcal(
     python: str, network: Network, start: Estimate, pixels: FloatArray
 ) -> tuple[FloatArray, FloatArray]:
     """Return the covariances of projections, px^2, (distances, k, 2, 2), and the interior parameters."""
-    frames = []
-    for R, X in zip(start.rotation, start.position, strict=True):
-        turn = FLIP @ R.T
-        frames.append(np.concatenate([vector_of(turn), -turn @ X]))
+    frames = [seen_from(R, X) for R, X in zip(start.rotation, start.position, strict=True)]
     with tempfile.TemporaryDirectory() as folder:
         given, answer = Path(folder) / "given.npz", Path(folder) / "answer.npz"
         np.savez(
@@ -148,13 +138,7 @@ def main() -> None:
     ratios = []
     for seed in range(options.seeds):
         network, truth = scene(seed)
-        adjustment = adjust(
-            network,
-            truth,
-            datum=Datum("control"),
-            reject="none",
-            options=AdjustmentOptions(sigma_px=NOISE_PX),
-        )
+        adjustment = calibrated(network, truth, NOISE_PX)
         known = projection_uncertainty(adjustment)
         known = replace(known, covariance=known.covariance / adjustment.sigma0**2)
         theirs, interior = with_mrcal(options.mrcal, network, truth, pixels)

@@ -20,6 +20,7 @@ from pathlib import Path
 import numpy as np
 
 from sfm.adjustment.datum import Datum
+from sfm.adjustment.result import Adjustment
 from sfm.adjustment.solve import AdjustmentOptions, adjust
 from sfm.model.camera import Camera, project
 from sfm.model.conventions import FloatArray, angles_from_rotation, rotation_from_vector
@@ -32,15 +33,28 @@ MOMENTS, NOISE_PX, PITCH = 14, 0.03, 30.0
 ROWS, COLUMNS, BASE = 6, 9, 100.0
 FLIP = np.diag([1.0, -1.0, -1.0])  # mrcal's camera axes in Kolinear's
 
-MRCAL = """
+# of mrcal 2.2 and later, which have other names of some arguments
+OPTIMIZE = """
 import json, sys
 import numpy as np, mrcal
+def optimize(inputs):
+    if "rt_cam_ref" not in mrcal.optimize.__doc__:  # version 2.2
+        inputs.update(
+            extrinsics_rt_fromref=inputs.pop("rt_cam_ref"), frames_rt_toref=inputs.pop("rt_ref_frame"),
+            points=np.zeros((0, 3)), observations_point=np.zeros((0, 3)),
+            indices_point_camintrinsics_camextrinsics=np.zeros((0, 3), dtype=np.int32))
+    return mrcal.optimize(**inputs)
+"""
+MRCAL = (
+    OPTIMIZE
+    + """
 data = np.load(sys.argv[1])
 found = []
 for xy in data["xy"]:
     observations = np.concatenate([xy, np.ones((*xy.shape[:-1], 1))], axis=-1)
+    rt_cam_ref = data["rt_cam_ref"].copy()
     inputs = dict(
-        intrinsics=data["intrinsics"].copy(), rt_cam_ref=data["rt_cam_ref"].copy(),
+        intrinsics=data["intrinsics"].copy(), rt_cam_ref=rt_cam_ref,
         rt_ref_frame=data["rt_ref_frame"].copy(), observations_board=observations,
         indices_frame_camintrinsics_camextrinsics=data["indices"], lensmodel="LENSMODEL_OPENCV4",
         imagersizes=np.array([[640, 480]] * 2, dtype=np.int32),
@@ -48,10 +62,11 @@ for xy in data["xy"]:
         do_optimize_intrinsics_core=True, do_optimize_intrinsics_distortions=True, do_optimize_frames=True,
         do_optimize_extrinsics=True, do_optimize_calobject_warp=False, do_apply_outlier_rejection=False,
         do_apply_regularization=False, verbose=False)
-    stats = mrcal.optimize(**inputs)
-    found.append((inputs["rt_cam_ref"][0].tolist(), float(stats["rms_reproj_error__pixels"])))
+    stats = optimize(inputs)
+    found.append((rt_cam_ref[0].tolist(), float(stats["rms_reproj_error__pixels"])))
 print(json.dumps(found))
 """
+)
 
 
 def cameras() -> tuple[Camera, ...]:
@@ -70,8 +85,7 @@ def cameras() -> tuple[Camera, ...]:
 def scene() -> tuple[Network, Estimate]:
     """Return the network with image points without noise, and the true values."""
     rng = np.random.default_rng(27)
-    grid = np.mgrid[0:ROWS, 0:COLUMNS].reshape(2, -1)
-    board = np.stack([PITCH * grid[1], PITCH * grid[0], np.zeros(ROWS * COLUMNS)], axis=1)
+    board = board_corners(ROWS, COLUMNS, PITCH)
     mounts = Mounts(
         np.array([[0.0, 0.0, 0.0], [BASE, -1.1, 0.0]]),
         np.array([np.eye(3), rotation_from_vector(np.array([-0.007, 0.0045, 0.0035]))]),
@@ -113,12 +127,31 @@ def noisy(network: Network, draws: int) -> list[FloatArray]:
     return [xy + NOISE_PX * rng.standard_normal(xy.shape) for _ in range(draws)]
 
 
+def board_corners(rows: int, columns: int, pitch: float) -> FloatArray:
+    """Return the corners of a flat board by rows, (rows * columns, 3)."""
+    grid = np.mgrid[0:rows, 0:columns].reshape(2, -1)
+    return np.stack([pitch * grid[1], pitch * grid[0], np.zeros(rows * columns)], axis=1)
+
+
+def calibrated(network: Network, start: Estimate, noise_px: float) -> Adjustment:
+    """Return the adjustment of corners of a board that is held, with this noise."""
+    return adjust(
+        network,
+        start,
+        datum=Datum("control"),
+        reject="none",
+        options=AdjustmentOptions(sigma_px=noise_px),
+    )
+
+
+def seen_from(R: FloatArray, X: FloatArray) -> FloatArray:
+    """Return mrcal's rotation vector and translation into a photograph with a rotation and position, (6,)."""
+    turn = FLIP @ R.T
+    return np.concatenate([vector_of(turn), -turn @ X])
+
+
 def with_mrcal(python: str, truth: Estimate, drawn: list[FloatArray]) -> tuple[FloatArray, FloatArray]:
     """Return the base of each draw from mrcal, mm, and the RMS residuals, px."""
-
-    def seen_from(R: FloatArray, X: FloatArray) -> FloatArray:
-        turn = FLIP @ R.T
-        return np.concatenate([vector_of(turn), -turn @ X])
 
     assert truth.mounts is not None
     # the flip applies to the axes of both cameras, but not to those of the board
@@ -165,13 +198,7 @@ def main() -> None:
     errors, sigmas, rms = [], [], []
     for xy in drawn:
         measured = replace(network, image_points=replace(network.image_points, xy=xy))
-        a = adjust(
-            measured,
-            truth,
-            datum=Datum("control"),
-            reject="none",
-            options=AdjustmentOptions(sigma_px=NOISE_PX),
-        )
+        a = calibrated(measured, truth, NOISE_PX)
         mount = rigs_of(a)[0].mounts[0]
         errors.append(np.array([mount.base, *mount.rotation_deg]) - exact)
         sigmas.append(np.array([mount.base_sigma, *mount.rotation_sigma_deg]))

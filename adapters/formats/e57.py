@@ -18,13 +18,11 @@ from typing import Any
 
 import numpy as np
 
+from adapters.formats.clouds import reading, reason_of, refuse_large, refuse_unusable
 from adapters.formats.content import Content, content_of_points, points_of
-from adapters.formats.las import reason_of
-from adapters.reading.text_lines import MAX_POINTS
-from sfm.files.csv_tables import MAX_NUMBER
 from sfm.files.whole_files import refuse_full, whole_file
 from sfm.model.conventions import METRES, FloatArray
-from sfm.model.errors import MissingLibraryError, OutputError, SurveyFileError
+from sfm.model.errors import OutputError, missing_library
 
 HEAD = "ASTM-E57"  # first bytes of a file
 EXTENSION, URI = "kolinear", "urn:kolinear:standard-deviations:1"
@@ -41,9 +39,7 @@ def load_pye57() -> Any:
     try:
         import pye57
     except ImportError as error:
-        raise MissingLibraryError(
-            "format e57 needs pye57; install it with: pip install 'kolinear[exchange]'"
-        ) from error
+        raise missing_library("format e57", ("pye57",), "exchange") from error
     return pye57
 
 
@@ -57,29 +53,20 @@ def read_e57(path: Path) -> Content:
     pye57 = load_pye57()
     scans: list[FloatArray] = []
     sigmas: list[FloatArray | None] = []
-    try:
-        with pye57.E57(str(path)) as file:
-            headers = [file.get_header(k) for k in range(file.scan_count)]
-            if sum(header.point_count for header in headers) > MAX_POINTS:
-                raise SurveyFileError(f"{path}: more than {MAX_POINTS} points, no more are read")
-            for k, header in enumerate(headers):
-                if not header.point_count:
-                    continue
-                data = file.read_scan(k, ignore_missing_fields=True)
-                scans.append(np.column_stack([np.asarray(data[axis], dtype=float) for axis in AXES]))
-                stated = set(header.point_fields).issuperset(SIGMAS) and len(scans[-1]) == header.point_count
-                sigmas.append(_read_fields(pye57, file, header, SIGMAS) if stated else None)
-            root = file.image_file.root()
-            crs = root["coordinateMetadata"].value() if root.isDefined("coordinateMetadata") else ""
-    except SurveyFileError:
-        raise
-    except Exception as error:  # libe57 and pye57 document no set of errors for damaged files
-        raise SurveyFileError(f"{path}: no readable E57 file ({reason_of(error)})") from error
-    if not scans:
-        raise SurveyFileError(f"{path}: no points are in it")
-    xyz = np.concatenate(scans)
-    if not (np.abs(xyz) <= MAX_NUMBER).all():
-        raise SurveyFileError(f"{path}: a coordinate is not a finite number of at most {MAX_NUMBER:g}")
+    with reading(path, "E57"), pye57.E57(str(path)) as file:
+        headers = [file.get_header(k) for k in range(file.scan_count)]
+        refuse_large(path, sum(header.point_count for header in headers))
+        for k, header in enumerate(headers):
+            if not header.point_count:
+                continue
+            data = file.read_scan(k, ignore_missing_fields=True)
+            scans.append(np.column_stack([np.asarray(data[axis], dtype=float) for axis in AXES]))
+            stated = set(header.point_fields).issuperset(SIGMAS) and len(scans[-1]) == header.point_count
+            sigmas.append(_read_fields(pye57, file, header, SIGMAS) if stated else None)
+        root = file.image_file.root()
+        crs = root["coordinateMetadata"].value() if root.isDefined("coordinateMetadata") else ""
+    xyz = np.concatenate([np.zeros((0, 3)), *scans])
+    refuse_unusable(path, xyz)
     known = [sigma for sigma in sigmas if sigma is not None]
     sigma = np.concatenate(known) if len(known) == len(sigmas) else None
     return content_of_points(path.name, xyz, sigma, unit="m", crs=crs)

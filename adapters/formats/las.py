@@ -16,11 +16,10 @@ from typing import Any
 
 import numpy as np
 
+from adapters.formats.clouds import reading, reason_of, refuse_large, refuse_unusable
 from adapters.formats.content import Content, content_of_points, points_of
-from adapters.reading.text_lines import MAX_POINTS
-from sfm.files.csv_tables import MAX_NUMBER
 from sfm.files.whole_files import whole_file
-from sfm.model.errors import MissingLibraryError, SurveyFileError
+from sfm.model.errors import missing_library
 
 HEAD = "LASF"  # first bytes of a file
 LARGEST = 2**31 - 1  # of the whole numbers
@@ -39,9 +38,7 @@ def load_laspy() -> Any:
         import laspy
         import lazrs  # noqa: F401  laspy compresses with it
     except ImportError as error:
-        raise MissingLibraryError(
-            "format laz needs laspy and lazrs; install them with: pip install 'kolinear[exchange]'"
-        ) from error
+        raise missing_library("format laz", ("laspy", "lazrs"), "exchange") from error
     return laspy
 
 
@@ -54,25 +51,17 @@ def read_laz(path: Path) -> Content:
     """
     laspy = load_laspy()
     notes: tuple[str, ...] = ()
-    try:
+    with reading(path, "LAZ or LAS"):
         with laspy.open(path) as file:
             header = file.header
-            if header.point_count > MAX_POINTS:
-                raise SurveyFileError(f"{path}: more than {MAX_POINTS} points, no more are read")
+            refuse_large(path, header.point_count)
             cloud = file.read()
         xyz = np.column_stack([cloud.x, cloud.y, cloud.z]).astype(float)
         known = set(cloud.point_format.extra_dimension_names)
         sigma = None
         if known.issuperset(SIGMAS):
             sigma = np.column_stack([np.asarray(cloud[name], dtype=float) for name in SIGMAS])
-    except SurveyFileError:
-        raise
-    except Exception as error:  # laspy and lazrs document no set of errors for damaged files
-        raise SurveyFileError(f"{path}: no readable LAZ or LAS file ({reason_of(error)})") from error
-    if not len(xyz):
-        raise SurveyFileError(f"{path}: no points are in it")
-    if not (np.abs(xyz) <= MAX_NUMBER).all():
-        raise SurveyFileError(f"{path}: a coordinate is not a finite number of at most {MAX_NUMBER:g}")
+    refuse_unusable(path, xyz)
     crs = ""
     try:
         system = header.parse_crs()
@@ -110,8 +99,3 @@ def write_laz(path: Path, content: Content) -> None:
             cloud[name] = column
     with whole_file(path) as part, part.open("wb") as file:
         cloud.write(file, do_compress=path.suffix.lower() != ".las")
-
-
-def reason_of(error: Exception) -> str:
-    """Return the first line of an error of a library."""
-    return " ".join(str(error).split("\n")[0].split())[:100] or type(error).__name__

@@ -59,6 +59,13 @@ class MissingLibraryError(BackendError):
     """An optional library is not installed; the message says how to install it."""
 
 
+def missing_library(what: str, libraries: tuple[str, ...], extra: str) -> MissingLibraryError:
+    """Return the error that something needs libraries of an extra of this package."""
+    it = "it" if len(libraries) == 1 else "them"
+    names = " and ".join(libraries)
+    return MissingLibraryError(f"{what} needs {names}; install {it} with: pip install 'kolinear[{extra}]'")
+
+
 def one_line(error: BaseException) -> str:
     """Return the message of an error on one line, or the name of its class if it has no message."""
     return " ".join(str(error).split()) or type(error).__name__

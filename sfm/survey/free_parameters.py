@@ -269,11 +269,8 @@ def _is_open(part: Network, start: Estimate, datum: str) -> bool:
                 covariance=False,
                 options=AdjustmentOptions(max_iterations=0),
             )
-        except (
-            GeometryError,
-            np.linalg.LinAlgError,
-        ):  # damped steps may lead to equations that can be solved
-            return False
+        except (GeometryError, np.linalg.LinAlgError):
+            return False  # damped steps may lead to equations that can be solved
         defects.append(begun.defect)
     return defects[0] > defects[1]
 

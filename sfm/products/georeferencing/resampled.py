@@ -20,7 +20,7 @@ import numpy as np
 
 from sfm.files.whole_files import refuse_existing, whole_file
 from sfm.model.conventions import AnyArray, FloatArray
-from sfm.model.errors import GeometryError, MissingLibraryError, OutputError, SurveyFileError
+from sfm.model.errors import GeometryError, OutputError, SurveyFileError, missing_library
 from sfm.products.georeferencing.transformation import PlaneTransformation
 
 WORLD = {".png": ".pgw", ".tif": ".tfw", ".tiff": ".tfw", ".jpg": ".jgw", ".jpeg": ".jgw"}
@@ -189,9 +189,7 @@ def projection_of(crs: str) -> str:
         from pyproj import CRS
         from pyproj.exceptions import CRSError
     except ImportError as error:
-        raise MissingLibraryError(
-            "--crs needs pyproj; install it with: pip install 'kolinear[exchange]'"
-        ) from error
+        raise missing_library("--crs", ("pyproj",), "exchange") from error
     try:
         return str(CRS.from_user_input(crs).to_wkt("WKT1_ESRI"))
     except CRSError:
