@@ -12,7 +12,8 @@ import pytest
 from scipy import stats
 
 from sfm.adjustment.datum import Datum
-from sfm.adjustment.result import Adjustment
+from sfm.adjustment.engine.correlated import correlated_sum
+from sfm.adjustment.result import Adjustment, ErrorCorrelation
 from sfm.adjustment.solve import adjust
 from sfm.judgement.hypotheses import alternatives, families, hypotheses, refit, score
 from sfm.judgement.hypotheses.alternatives import (
@@ -558,3 +559,39 @@ def test_a_photograph_with_more_noise_has_a_spread_by_itself() -> None:
     assert found
     for one in found:
         assert one.factor.sum() == 1 and 3 < one.spread.factor < 9
+
+
+def test_the_design_effect_is_of_the_eigenvalues_of_the_variance_over_that_of_independent_errors(
+    dense: Dense,
+) -> None:
+    """Sum of their squares over their sum; 1 without correlation, and for columns that determine nothing."""
+    D = dense.reduced.whiten(dense.columns.freedoms)[:, :, :3]
+    assert dense.reduced.design_effect(D) == 1
+    near = ErrorCorrelation(alone=0.2, common=1.5, length_px=400.0)
+    reduced = replace(dense.reduced, adjustment=replace(dense.a, error_correlation=near))
+    network, used = dense.a.network, reduced.used
+    H = reduced.project(D)[0]
+    common = correlated_sum(
+        reduced.image,
+        network.image_points.xy[used],
+        dense.a.sigma0_px * reduced.F,
+        reduced.absorb(D)[2],
+        near,
+        network.may_correlate[used],
+    )
+    eigenvalues = np.linalg.eigvals(np.linalg.solve(H, H + common)).real
+    expected = (eigenvalues**2).sum() / eigenvalues.sum()
+    assert reduced.design_effect(D) == pytest.approx(expected) and expected > 1.05
+    assert reduced.design_effect(np.zeros_like(D)) == 1
+
+
+def test_the_spread_of_photographs_that_differ_by_chance_is_one() -> None:
+    """Their scores along a direction are independent; what the unknowns take up makes it smaller."""
+    factors = []
+    for number in range(24):
+        network, truth = make_network(seed_of(f"spread of chance {number}"), images=8, points=24, free=("c",))
+        reduced = reduce_adjustment(adjust(network, truth, datum=Datum("free"), reject="none"))
+        of_k1 = [one for one in alternatives.interiors(reduced, families.HELD) if len(one.parameters) == 1]
+        assert all(one.spread.redundancy == 7 and not one.spread.among for one in of_k1)
+        factors.append(of_k1[0].spread.factor)
+    assert 0.4 < np.mean(factors) < 1.2 and np.std(factors) > 0.2

@@ -15,6 +15,8 @@ from sfm.judgement.calibrated_cameras import (
     CalibratedCamera,
     calibrated_cameras,
     camera_is_result,
+    families,
+    family_of_photographs,
     interior_of,
     interior_parameters,
     projection_of,
@@ -147,3 +149,19 @@ def test_shared_parameters_come_first_and_count_all_photographs() -> None:
     )
     assert {one.owner for one in interior.single} == set(owners) - names_of_families
     assert [len(one) for one in interior.sigmas] == [len(names)] * 2
+
+
+def test_a_family_has_the_name_and_the_values_of_its_first_camera() -> None:
+    """Cameras 1 and 3 share their parameters, camera 2 is of its own kind."""
+    network, truth = make_network(seed_of("families"), images=6, points=14, cameras=3, free=("c",))
+    first, second, third = truth.cameras
+    shared = ("lens",) * len(first.names)
+    third = replace(third.with_parameters(first.parameters), shared=shared)
+    cameras = (replace(first, shared=shared), second, third)
+    a = sfm.adjust(network, replace(truth, cameras=cameras), reject="none")
+    found = families(a)
+    assert [camera.name for _, camera in found] == [first.name, second.name]
+    assert len({name for name, _ in found}) == 2
+    of = family_of_photographs(a)
+    assert (of[network.camera == 0] == of[network.camera == 2].min()).all()
+    assert set(of[network.camera == 1]).isdisjoint(of[network.camera != 1])

@@ -16,12 +16,14 @@ from sfm.judgement.given.free_network import FreeNetwork
 from sfm.judgement.given.groups import GivenSettings
 from sfm.judgement.given.judge import JudgedGiven, judge_given
 from sfm.judgement.given.tables import Contradiction, Table
+from sfm.model.conventions import angles_from_rotation, rotation_from_vector
 from sfm.model.estimate import Estimate, values_of
 from sfm.model.network import ExteriorObservations, Network, ScaleBars
 from sfm.model.observations.kind import MOUNT, PHOTOGRAPH, POINT
 from sfm.model.observations.point_pairs import HeightDifferences
+from sfm.model.observations.pose import MountObservations
 from sfm.model.remarks.remark import kinds_of
-from sfm.model.similarity import Similarity
+from sfm.model.similarity import Similarity, fit_similarity
 from tests.rigs import make_rig
 from tests.synthetic import make_network, observed_anew, seed_of
 
@@ -182,3 +184,29 @@ def test_motions_of_unknowns_are_those_of_a_similarity(size: float) -> None:
     bases = np.where(truth.mounts.free[:, :3], values.mount_position, 0.0)
     np.testing.assert_allclose(found[MOUNT][:, :3, 6] * size, bases)
     assert not found[MOUNT][:, 3:].any() and not found[MOUNT][:, :, :6].any() and bases.any()
+
+
+@pytest.mark.parametrize("scale", [0.1, 8.0])
+def test_mounts_are_compared_in_the_frame_of_the_object_whatever_that_of_the_network(scale: float) -> None:
+    """What is left of their covariance beside the seven motions, and their differences, are the same."""
+    network, truth = make_rig(seed_of("frame of mounts"), moments=4, cameras=3, points=20)
+    frame = Similarity(scale, rotation_from_vector(np.array([0.2, -0.4, 0.7])), np.array([3.0, 1.0, -2.0]))
+    assert truth.mounts is not None
+    angles = np.array(
+        [angles_from_rotation(np.swapaxes(truth.mounts.rotation, 1, 2)[k]) for k in (1, 2)], dtype=float
+    )
+    covariance = np.tile(np.diag([1e-8] * 3 + [1e-8] * 3), (2, 1, 1))
+    mounts = MountObservations(np.array([1, 2]), truth.mounts.position[1:], angles, covariance)
+    models = []
+    for placing in (UNCHANGED, frame):
+        start = placing.inverse().apply_estimate(truth)
+        free = FreeNetwork(adjust(network, start, datum=Datum("free"), reject="none"))
+        reference = free.reference_of([mounts])
+        assert reference is not None
+        to_object = fit_similarity(free.adjustment.estimate.points, truth.points)
+        models.append(reference.differences([mounts], to_object)[0])
+    one, other = models
+    np.testing.assert_allclose(
+        other.precision, one.precision, rtol=1e-4, atol=1e-5 * abs(one.precision).max()
+    )
+    assert other.kept().chi2 == pytest.approx(one.kept().chi2, rel=1e-3)

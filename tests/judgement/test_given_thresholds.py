@@ -388,3 +388,22 @@ def test_only_doubtful_points_with_stated_precision_are_weighted(
     )
     group = given_groups.Group("control", np.arange(3), ("a", "b", "c"), placed)
     np.testing.assert_array_equal(group.taking_part(rescale=rescale).stated, factor * np.ones(3))
+
+
+def test_coordinates_that_nobody_stated_precise_have_their_scatter_and_no_factor(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    network, truth = make_network(seed_of("not exact"), images=8, points=30)
+    xyz = truth.points[:12] + 4e-4 * seed_of("errors of fixed control").standard_normal((12, 3))
+    control = KnownPoints.from_arrays([str(k + 1) for k in range(12)], xyz)
+    scattering, judged = given._scattering, []
+
+    def kept(*of: Any) -> Any:
+        judged.append(scattering(*of))
+        return judged[-1]
+
+    monkeypatch.setattr(given, "_scattering", kept)
+    run_survey(survey_of(network, truth, control=control, datum={"kind": "control"}))
+    assert judged and all(group.judgement.factor == 1 for group in judged)
+    assert judged[-1].scatter == pytest.approx(4e-4, rel=0.4)
+    assert not judged[-1].judgement.fits or judged[-1].judgement.probability < 1e-3

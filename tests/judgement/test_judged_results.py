@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
 
@@ -19,7 +20,7 @@ from sfm.adjustment.solve import adjust
 from sfm.judgement import verdict as verdicts
 from sfm.judgement.bundle_statistics import Given, statistics_of
 from sfm.judgement.checks import ControlCoordinate, LongestResidual, sigma0_of
-from sfm.judgement.survey_result import SurveyResult
+from sfm.judgement.survey_result import PhotographTargets, SurveyResult
 from sfm.model.distributions import normal_ppf
 from sfm.model.network import ScaleBars
 from sfm.model.observation_residuals import CENTRE, ROTATION, GivenResiduals
@@ -313,3 +314,35 @@ def test_a_kind_of_given_values_that_scatters_more_than_stated_is_named(bars: in
         )
     others = verdicts._kinds(statistics, {"scale"}, LEVEL)
     assert ("scale bars",) not in [one.names("of") for one in others]
+
+
+def test_the_level_is_shared_by_the_kinds_that_are_tested(
+    a: Adjustment, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Image points are no given values; each side of a test has the level of the question."""
+    asked = []
+    monkeypatch.setattr(verdicts, "component_tests", lambda kinds, alpha: asked.append(alpha) or ())
+    for names in (("image points",), ("image points", "bars"), ("image points", "bars", "control")):
+        statistics: Any = SimpleNamespace(kinds=SimpleNamespace(names=names))
+        assert verdicts._kinds(statistics, set(), LEVEL) == ()
+    assert asked == pytest.approx([2 * LEVEL, 2 * LEVEL, LEVEL])
+
+
+def test_a_result_counts_its_coded_points(a: Adjustment) -> None:
+    code = np.where(np.arange(len(a.network.points)) < 5, np.arange(len(a.network.points)), -1)
+    result = replace(result_of(a), code=code)
+    assert "14, 5 coded" in str(result) and "14, 0 coded" in str(result_of(a))
+
+
+def test_an_overlay_was_stored_if_all_its_image_points_were() -> None:
+    def part(k: int, stored: bool, **more: Any) -> PhotographTargets:
+        of, none = np.full((k, 2), float(k)), np.zeros((0, 2))
+        return PhotographTargets(
+            "1", Path("1.jpg"), of, of, of[:, 0], none, np.zeros(0, np.int64), stored=stored, **more
+        )
+
+    for first, second in ((True, True), (True, False), (False, True), (False, False)):
+        joined = part(2, first, flag=np.array([1, 2])).with_more(part(3, second, blur=np.full(3, 0.5)))
+        assert joined.stored == (first and second) and len(joined.xy) == len(joined.angle) == 5
+        assert joined.flag is not None and joined.flag.tolist() == [1, 2, 0, 0, 0]
+        assert joined.blur is not None and np.isnan(joined.blur).tolist() == [True] * 2 + [False] * 3

@@ -234,3 +234,18 @@ def test_a_direction_of_a_pose_that_nothing_checks_gains_nothing(share: float, c
     gain, shift = _gain(s[None], G.reshape(1, 6, 1, 6), 0, [])
     assert gain == (pytest.approx(2 / share, rel=1e-3) if counts else pytest.approx(0.0, abs=1e-9))
     assert bool(np.abs(shift).max() > 1) == counts
+
+
+def test_a_freed_photograph_is_compared_with_one_that_shares_its_pose() -> None:
+    """Another one that left its place first would count as where the rig is."""
+    network, truth = scene(7, 3)
+    moved = network
+    out = (1, 4, 13)  # of the second camera, at moments 0, 1 and 4
+    for i, by in zip(out, (0.03, 0.01, -0.02), strict=True):
+        moved = bumped(moved, truth, i, np.array([by, 0.0, 0.0]))
+    number = np.arange(len(moved.images))
+    assert moved.moment is not None
+    free = replace(moved, moment=np.where(np.isin(number, out), 99 + number, moved.moment))
+    a = adjust(free, truth, reject="none")
+    found = list(_of_freed(a, np.array(out), network.moment))
+    assert [one.shift for one in found] == pytest.approx([0.03, 0.01, 0.02], abs=1e-3)

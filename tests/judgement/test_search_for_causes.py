@@ -376,3 +376,54 @@ def test_weighted_down_or_kept_gross_errors_are_rejected_before_causes_are_sough
     for other in (a, weighted, replace(tested, datum="control")):
         found = free_network(other)
         assert found is not None and found is not other
+
+
+def test_kinds_whose_scores_are_near_that_of_the_best_are_adjusted_too(
+    zoomed: Adjustment, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """One of each; none of those that explain much less, as what explains more has been adjusted before."""
+    every = alternatives_of(reduce_adjustment(zoomed))
+    best = next(one for one in every if one.kind == "other_camera")
+    tried: list[str] = []
+
+    def adjusted(plain: Adjustment, one: Alternative, *_: Any, **__: Any) -> Refit:
+        tried.append(one.kind)
+        return refitted(zoomed, gain=one.price + (60.0 if one.kind == best.kind else 59.0))
+
+    monkeypatch.setattr(hypotheses, "_to_adjust", lambda *_: [best])
+    monkeypatch.setattr(hypotheses, "refit", adjusted)
+    for lead in (0.0, 40.0, np.inf):
+        monkeypatch.setattr(hypotheses, "MIN_LEAD", lead)
+        tried.clear()
+        cause = hypotheses._best(zoomed)
+        assert cause is not None
+        near = {
+            one.kind for one in every if one.evidence_beside_spread > best.evidence_beside_spread - lead
+        } - {best.kind}
+        assert tried[0] == best.kind and sorted(tried[1:]) == sorted(near)
+        assert {one.kind for one, _ in cause.as_well} == (near if lead > 1 else set())
+    assert near
+
+
+@pytest.mark.parametrize(
+    ("points", "bars", "without"), [(8, 0, "control"), (14, 1, "control"), (7, 1, None), (0, 0, None)]
+)
+def test_coordinates_that_are_all_given_shift_without_the_control_alone(
+    points: int, bars: int, without: str | None, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Of 14 points: in a calibration, where most are given, and where none is unknown."""
+    network, truth = make_network(seed_of("given or not"), images=6, points=14, free=("c",))
+    network = network.with_control(network.points[:points], truth.points[:points], 0.0)
+    if bars:
+        network = network.with_scale_bar(
+            "1", "2", float(np.linalg.norm(np.diff(truth.points[:2], axis=0))), 1e-4
+        )
+    final = adjust(network, truth, datum=Datum("control" if points else "free"), reject="none")
+    of = []
+    monkeypatch.setattr(hypotheses, "_judge_free", lambda _, __, of_what: of.append(of_what) or NOTHING)
+    monkeypatch.setattr(hypotheses, "cause_in_calibration", lambda *_: None)
+    judge_alternatives(final)
+    assert of == [without]
+
+
+NOTHING = hypotheses.JudgedAssumptions()

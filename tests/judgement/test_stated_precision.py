@@ -9,6 +9,8 @@ import pytest
 
 import sfm
 from sfm.adjustment.datum import Datum
+from sfm.judgement.stated_precision import stated_precision_remarks
+from sfm.model.distributions import normal_ppf
 from sfm.model.estimate import Estimate
 from sfm.model.network import Network
 from sfm.model.remarks.remark import of_kind
@@ -98,3 +100,22 @@ def test_standard_deviations_within_one_per_cent_are_one_class(ratio: float, poi
     a = sfm.adjust(replace(network, image_points=points_seen), truth, datum=Datum("free"), reject="none")
     (said,) = of_kind(a.verdict.remarks, "image_sigmas")
     assert len(said.names("points")) == points
+
+
+@pytest.mark.parametrize("others", [0.3, 3.0])
+@pytest.mark.parametrize(("ratio", "named"), [(1.4, False), (1.6, True)])
+def test_classes_are_compared_by_their_ratio_whatever_sigma0_is(
+    others: float, ratio: float, named: bool
+) -> None:
+    """A ratio below 1.5 changes no result, however surely it is known."""
+    network, truth = stated("ratio of classes", 2.0, points=16)
+    a = sfm.adjust(network, truth, datum=Datum("free"), reject="none")
+    scale = np.where(network.image_points.point < 16, ratio, 1.0) * others
+    rank = np.empty(len(scale))  # both classes have the quantiles of a normal distribution
+    for few in (network.image_points.point < 16, network.image_points.point >= 16):
+        rank[few] = (np.arange(few.sum()) + 0.5) / few.sum()
+    w = scale[:, None] * normal_ppf(np.stack([rank, rank], axis=1))
+    said = stated_precision_remarks(replace(a, standardised=np.tile(w, (1, 1))))
+    assert len(said) == named
+    if named:
+        assert said[0].number("factor") == pytest.approx(ratio, rel=0.02)
