@@ -23,6 +23,7 @@ FRONTS = (
     multifrontal._sum_front,
     multifrontal._extend,
     multifrontal_factor._pick,
+    multifrontal_factor._by_border,
     multifrontal_factor._sum_pairs,
 )
 PAIRED = (

@@ -14,7 +14,7 @@ from sfm.adjustment.datum import Datum
 from sfm.adjustment.engine import iterate, normals
 from sfm.adjustment.engine.cofactors import hat_complement, marginal_covariance
 from sfm.adjustment.engine.normals import MIN_HALVED_POINTS, Equations
-from sfm.adjustment.engine.solvers import choice
+from sfm.adjustment.engine.solvers import choice, multifrontal_factor
 from sfm.adjustment.engine.solvers.choice import choose_solver
 from sfm.adjustment.engine.solvers.dense import DenseFactor, DenseSolver
 from sfm.adjustment.engine.solvers.fronts import LEAF, dissect, pairs_of
@@ -129,6 +129,29 @@ def test_covariance_of_fronts_and_pairs_equals_that_of_the_product_of_full_rows(
     assert np.abs(complement_of(fronts) - complement_of(full)).max() < 1e-9
     some = np.arange(0, 500, 37), np.array([5, 77, 1200])
     assert in_sigmas(fronts.joint(*some), full.joint(*some)) < 1e-9
+
+
+def test_a_camera_for_each_photograph_has_the_covariance_of_full_rows(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    """Interior unknowns are the border of the fronts; points are multiplied by it a few at a time."""
+    network, truth = aerial("own cameras", 6, 14, 1000, tilt=0.4)
+    m = len(network.images)
+    cameras = tuple(replace(lens(("c", "K1")), name=f"camera {k}") for k in range(m))
+    network, truth = replace(network, camera=np.arange(m)), replace(truth, cameras=cameras)
+    a = run(network, truth, covariance=False, tolerance=1e-9)
+    monkeypatch.setattr(multifrontal_factor, "MOST_VALUES", 3 * 2 * m * 16)
+    fronts = marginal_of(a, datum=Datum("free"))
+    monkeypatch.setattr(iterate, "choose_solver", DenseSolver)
+    full = marginal_of(a, datum=Datum("free"))
+    assert isinstance(fronts.optimum.factor, MultifrontalFactor)
+    assert isinstance(full.optimum.factor, DenseFactor)
+    Q, reference = (marginal_covariance(m.optimum, m.layout, m.cofactors, 1.0) for m in (fronts, full))
+    seen = np.diagonal(reference.exterior, axis1=1, axis2=2).all(axis=1)
+    assert seen.mean() > 0.9 and in_sigmas(Q.points, reference.points) < 1e-7
+    assert in_sigmas(Q.exterior[seen], reference.exterior[seen]) < 1e-7
+    some = np.flatnonzero(np.repeat(seen, 6))[::37], np.array([5, 77, 700])
+    assert in_sigmas(fronts.joint(*some), full.joint(*some)) < 1e-7
 
 
 def test_calibrated_cameras_are_adjusted_pair_by_pair_too() -> None:

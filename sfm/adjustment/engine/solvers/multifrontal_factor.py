@@ -30,6 +30,8 @@ from sfm.model.conventions import AnyArray, FloatArray, IntArray
 from sfm.runtime.compiling import kernel
 from sfm.runtime.small_algebra import add_product
 
+MOST_VALUES = 2**22  # values of object points by interior and kept unknowns at a time, 32 MB
+
 
 class EliminatedFront(NamedTuple):
     """Part of the factor from eliminating the photographs of a front."""
@@ -109,7 +111,7 @@ class MultifrontalFactor:
         core, exterior = np.zeros((n, 3, 3)), np.empty((len(b.U), 6, 6))
         YQ = np.zeros((len(b.Y) if cross else most, 3, 6))
         YQ_border = np.zeros((n if cross else 1, 3, border))
-        u, uQ = np.empty((3, border)), np.empty((3, border))
+        together = max(1, MOST_VALUES // max(3 * border, 1))  # points multiplied by Q at once
         for front, Z in self._inverse_fronts():
             scale = s[front.rows]
             Z_own = Z * scale
@@ -118,10 +120,14 @@ class MultifrontalFactor:
                 at = slice(6 * i, 6 * i + 6)
                 rows = slice(6 * photograph, 6 * photograph + 6)
                 exterior[photograph] = Z_own[at, at] + XQ[rows] @ X[rows].T
-            _sum_pairs(
-                observations, front.points, self.fronts.local, b.Y, b.Y_interior, Z_own.reshape(-1),
-                len(Z_own), X, Q, u, uQ, cross, core, YQ, YQ_border,
-            )  # fmt: skip
+            for begin in range(0, len(front.points), together):
+                points = front.points[begin : begin + together]
+                u = np.empty((len(points), 3, border))
+                _by_border(observations, points, b.Y, b.Y_interior, X, u)
+                _sum_pairs(
+                    observations, points, self.fronts.local, b.Y, b.Y_interior, Z_own.reshape(-1),
+                    len(Z_own), X, (u.reshape(-1, border) @ Q).reshape(u.shape), cross, core, YQ, YQ_border,
+                )  # fmt: skip
         if not cross:
             YQ, YQ_border = YQ[:0], YQ_border[:0]
         return Inverse(exterior, -XQ, Q, core, YQ, YQ_border)
@@ -164,6 +170,30 @@ def _pick(Z: FloatArray, into: IntArray, part: AnyArray) -> None:
 
 
 @kernel
+def _by_border(
+    observations: Observations,
+    points: IntArray,
+    Y: FloatArray,
+    Y_interior: FloatArray,
+    X: FloatArray,
+    u: FloatArray,
+) -> None:
+    """Fill u = Y'X - Y_interior of some object points, (p, 3, i + 3 s)."""
+    inner = Y_interior.shape[2]
+    for k in range(len(points)):
+        j = points[k]
+        for p in range(3):
+            for c in range(u.shape[2]):
+                u[k, p, c] = -Y_interior[j, p, c] if c < inner else 0.0
+        for t in range(observations.start[j], observations.start[j + 1]):
+            column = 6 * observations.pose[t]
+            for p in range(3):
+                for q in range(6):
+                    for c in range(u.shape[2]):
+                        u[k, p, c] += Y[t, p, q] * X[column + q, c]
+
+
+@kernel
 def _sum_pairs(
     observations: Observations,
     points: IntArray,
@@ -173,41 +203,25 @@ def _sum_pairs(
     Z: FloatArray,
     size: int,
     X: FloatArray,
-    Q: FloatArray,
-    u: FloatArray,
     uQ: FloatArray,
     cross: bool,
     core: FloatArray,
     YQ: FloatArray,
     YQ_border: FloatArray,
 ) -> None:
-    """Fill Y'S^-1 and Y'S^-1 Y of the object points of a front; Z of its photographs is row-major."""
+    """Fill Y'S^-1 and Y'S^-1 Y of object points of a front; Z of its photographs is row-major."""
     inner = Y_interior.shape[2]
-    for j in points:
+    for k in range(len(points)):
+        j = points[k]
         begin, end = observations.start[j], observations.start[j + 1]
         shift = 0 if cross else begin
-        for p in range(3):  # u = Y'X - Y_interior
-            for c in range(len(Q)):
-                u[p, c] = -Y_interior[j, p, c] if c < inner else 0.0
-        for t in range(begin, end):
-            column = 6 * observations.pose[t]
-            for p in range(3):
-                for q in range(6):
-                    for c in range(len(Q)):
-                        u[p, c] += Y[t, p, q] * X[column + q, c]
-        for p in range(3):
-            for c in range(len(Q)):
-                total = 0.0
-                for s in range(len(Q)):
-                    total += u[p, s] * Q[s, c]
-                uQ[p, c] = total
         for s in range(begin, end):
             row = 6 * observations.pose[s]
             for p in range(3):
                 for q in range(6):
                     total = 0.0
-                    for c in range(len(Q)):
-                        total += uQ[p, c] * X[row + q, c]
+                    for c in range(uQ.shape[2]):
+                        total += uQ[k, p, c] * X[row + q, c]
                     YQ[s - shift, p, q] = total
             for t in range(begin, end):
                 add_product(YQ, s - shift, Y, t, Z, 6 * local[t] * size + 6 * local[s], size)
@@ -218,7 +232,7 @@ def _sum_pairs(
         for p in range(3):
             for q in range(3):
                 for c in range(inner):
-                    core[j, p, q] -= uQ[p, c] * Y_interior[j, q, c]
+                    core[j, p, q] -= uQ[k, p, c] * Y_interior[j, q, c]
             if cross:
-                for c in range(len(Q)):
-                    YQ_border[j, p, c] = -uQ[p, c]
+                for c in range(uQ.shape[2]):
+                    YQ_border[j, p, c] = -uQ[k, p, c]
