@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Iterable
 from dataclasses import dataclass, replace
 from datetime import date
-from functools import cache, cached_property
+from functools import cached_property
 from pathlib import Path
 
 import numpy as np
@@ -17,7 +17,7 @@ from sfm.comparison.solutions import BaselineComparison
 from sfm.comparison.two_adjusters.adjusters import AdjusterComparison
 from sfm.model.camera import Camera
 from sfm.model.conventions import FloatArray, IntArray
-from sfm.model.display import counted, html_table, text_table
+from sfm.model.display import counted, html_table, in_words, text_table
 from sfm.model.estimate import Estimate
 from sfm.model.network import Network
 from sfm.model.remarks.remark import Remark
@@ -111,7 +111,7 @@ class PhotographTargets:
 
     def reasons(self) -> list[tuple[str, int]]:
         """Return (reason, number of candidates) of this photograph, most frequent first."""
-        return [(in_words(name), count) for name, count in count_flags(self.rejected_flag)]
+        return [(name.replace("_", " "), count) for name, count in count_flags(self.rejected_flag)]
 
 
 @dataclass(frozen=True)
@@ -248,7 +248,9 @@ class SurveyResult:
             xy += [photograph.xy, photograph.rejected_xy]
             ellipses += [np.column_stack([photograph.semi_axes, photograph.angle])]
             ellipses += [np.full((rejected, 3), np.nan)]
-            reasons += [""] * measured + [_reason(int(flag)) for flag in photograph.rejected_flag]
+            reasons += [""] * measured + [
+                in_words(Flag, flag) or "no reason kept" for flag in photograph.rejected_flag.tolist()
+            ]
         return SeenTargets(
             np.array(image, dtype=np.int64), np.vstack(xy), np.vstack(ellipses), tuple(reasons)
         )
@@ -351,22 +353,10 @@ class SurveyResult:
         return self.unit if self.has_scale else NO_SCALE
 
 
-@cache
-def _reason(flag: int) -> str:
-    """Return the reasons why a candidate was not measured, in words."""
-    names = [in_words(str(reason.name).lower()) for reason in Flag if reason.value and flag & reason.value]
-    return ", ".join(names) or "no reason kept"
-
-
 def sort_likeliest_first(reasons: Iterable[str]) -> list[str]:
     """Sort reasons for rejection so that reasons for the most target-like candidates come first.
 
     Reasons that do not concern a candidate, such as a target measured but not used, precede them all.
     """
-    rank = {in_words(str(flag.name).lower()): k for k, flag in enumerate(LIKELIEST_FIRST)}
+    rank = {in_words(Flag, flag): k for k, flag in enumerate(LIKELIEST_FIRST)}
     return sorted(reasons, key=lambda reason: (rank.get(reason, -1), reason))
-
-
-def in_words(flag_name: str) -> str:
-    """Return the name of a flag in words, such as `cut by border`."""
-    return flag_name.replace("_", " ")

@@ -35,7 +35,6 @@ from sfm.matching.correlation import (
     NccFlag,
     NccLimits,
     ambiguous,
-    in_words,
     independent_pixels,
     match_ncc,
     match_ncc_warped,
@@ -44,6 +43,7 @@ from sfm.matching.radiometry import grey_of, grey_of_8_bit, shrink_photograph
 from sfm.matching.tracks.features import match_features, sift_features
 from sfm.model.arguments import checked_arguments
 from sfm.model.conventions import MAD_TO_SIGMA, AnyArray, FloatArray, IntArray
+from sfm.model.display import in_words
 from sfm.model.errors import GeometryError
 
 TILE_PX = 128  # side of the squares whose spectra are averaged

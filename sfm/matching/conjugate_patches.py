@@ -21,7 +21,6 @@ from sfm.matching.correlation import (
     NccLimits,
     NccMatches,
     ambiguous,
-    in_words,
     independent_pixels,
     match_ncc,
     match_ncc_warped,
@@ -32,6 +31,7 @@ from sfm.matching.lsm.two_photo import LsmSettings, match_lsm
 from sfm.matching.radiometry import equalise_histogram, grey_of
 from sfm.model.arguments import checked_fields
 from sfm.model.conventions import AnyArray, BoolArray, FloatArray, IntArray
+from sfm.model.display import in_words
 from sfm.runtime.sampling import AFTER, BEFORE
 
 METHODS = {"ncc": "", "lsm": "affine", "lsm8": "projective", "shift": "shift"}

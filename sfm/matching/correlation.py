@@ -490,10 +490,3 @@ class LsmFlag(IntFlag):
     OUTSIDE = 1 << 2  # the window, or the margin of its kernel, reaches beyond a photograph
     TOO_FAR = 1 << 3  # farther from the start than allowed
     LOW_CORRELATION = 1 << 4  # converged, but the patches are not similar
-
-
-def in_words(kind: type[LsmFlag] | type[NccFlag], flag: int) -> str:
-    """Return the names of the flags that are set, in words; empty if none is."""
-    return ", ".join(
-        str(member.name).lower().replace("_", " ") for member in kind if member.value and flag & member.value
-    )

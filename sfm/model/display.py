@@ -5,6 +5,8 @@ from __future__ import annotations
 import re
 import textwrap
 from collections.abc import Iterable, Sequence
+from enum import IntFlag
+from functools import cache
 
 MAX_LISTED = 5  # items in one message
 NO_BREAK = "\N{NO-BREAK SPACE}"
@@ -24,6 +26,18 @@ TEMPLATE = """\
 def program_name(key: str) -> str:
     """Return the name of a program in its usual spelling."""
     return PROGRAMS.get(key, key)
+
+
+@cache
+def in_words(kind: type[IntFlag], flags: int) -> str:
+    """Return the names of the flags of a kind that are set, in words such as `cut by border`; or nothing.
+
+    Args:
+        kind: what the flags mean.
+        flags: flags, one bit each.
+    """
+    names = [str(member.name).lower() for member in kind if member.value and flags & member.value]
+    return ", ".join(names).replace("_", " ")
 
 
 def html_table(title: str, header: Sequence[str], rows: Sequence[Sequence[str]]) -> str:

@@ -20,7 +20,7 @@ from sfm.judgement.given.judge import judge_given
 from sfm.judgement.given.scales import Comparison, Scales, Source
 from sfm.judgement.given.values import GivenModel, Judgement
 from sfm.model.distributions import LEVEL
-from sfm.model.network import Network, ScaleBars
+from sfm.model.network import Network, ObjectPoints, ScaleBars
 from sfm.model.remarks.remark import Remark, kinds_of, of_kind
 from sfm.pipeline import run_survey
 from sfm.survey.inputs.exterior_table import ObservedExterior
@@ -330,12 +330,12 @@ def test_standard_deviations_are_enlarged_only_where_they_are_stated_and_wrong(
 ) -> None:
     of = {"doubtful": (), "factor": 2.0, "rescale": True, "estimated": False, "fixed": False} | case
     stated = np.diag([0.0, 0.0, np.inf] if of["fixed"] else [1e-4, 4e-4, np.inf])[None]
-    group: Any = SimpleNamespace(
-        scatter=0.0,
-        judgement=SimpleNamespace(doubtful=of["doubtful"], factor=of["factor"]),
-        placed=SimpleNamespace(model=SimpleNamespace(estimated=of["estimated"], factor=lambda: (3.0, 0.0))),
-    )
-    found = given_groups.Group._confirmed(group, stated, of["rescale"])
+    judgement = SimpleNamespace(doubtful=of["doubtful"], factor=of["factor"], wrong=())
+    model = SimpleNamespace(estimated=of["estimated"], factor=lambda: (3.0, 0.0))
+    placed: Any = SimpleNamespace(judgement=judgement, model=model, order=())
+    group = given_groups.Group("control", np.arange(1), ("a",), placed)
+    points = ObjectPoints(np.arange(1), np.zeros((1, 3)), stated)
+    found = group.as_judged(points, rescale=of["rescale"], used=True).covariance
     np.testing.assert_allclose(found, np.where(np.isfinite(stated), factor**2 * stated, stated))
 
 

@@ -222,13 +222,15 @@ def test_points_that_take_part_are_those_that_fit_with_the_precision_that_they_h
 
 
 def test_fixed_points_that_scatter_have_their_scatter() -> None:
-    _, groups, _ = two_groups(np.zeros(3), "scatter of fixed")
+    _, groups, given = two_groups(np.zeros(3), "scatter of fixed")
     fixed = np.zeros((6, 3, 3))
     fixed[1, 2, 2] = np.inf
+    points = ObjectPoints(np.arange(6), given[:6], fixed)
     scattering = replace(groups[0], scatter=2e-3)
-    found = scattering._confirmed(fixed, True)
+    found = scattering.as_judged(points, rescale=True, used=True).covariance
     assert np.isinf(found[1, 2, 2]) and found[0, 0, 0] == pytest.approx(SIGMA**2)
-    np.testing.assert_array_equal(scattering._confirmed(fixed, False), fixed)
+    unchanged = scattering.as_judged(points, rescale=False, used=True).covariance
+    np.testing.assert_array_equal(unchanged, fixed)
 
 
 @pytest.mark.parametrize(("ratio", "weak"), [(1.15, False), (1.3, True)])

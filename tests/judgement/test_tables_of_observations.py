@@ -147,10 +147,12 @@ def test_image_points_confirm_the_rest_where_a_kind_contradicts_them_alone(right
 def test_values_that_are_right_count_with_the_rest(right: list[Rows]) -> None:
     right.append(Rows("bars", np.array([0.1, -0.1, 0.0])))
     some = [table(0, "heights", 30.0, 30.1, 29.9)]
-    assert judge()._without(some, "heights") == 1.0
-    assert judge()._rest(some, "heights") is None  # 2 of the rest, 3 of the heights
+    (one,) = judge().contradicting(some)
+    assert one.kind == "heights" and one.whole
+    assert one.rest is None  # 2 of the rest, 3 of the heights
     right.append(Rows("control", np.zeros(4)))
-    assert judge()._rest(some, "heights") == 6
+    (one,) = judge().contradicting(some)  # nothing contradicts without them
+    assert one.kind == "heights" and one.whole and one.rest == 6
 
 
 def test_the_kind_that_scatters_is_imprecise(right: list[Rows]) -> None:

@@ -144,20 +144,16 @@ class Group:
             order[self.rows] = self.rows[list(self.placed.order)]
             given = given.reordered(order)
         covariance = given.coordinate_covariance.copy()
-        covariance[self.rows] = self._confirmed(covariance[self.rows], rescale)
-        return given.with_coordinate_covariance(covariance).select(keep)
-
-    def _confirmed(self, covariance: FloatArray, rescale: bool) -> FloatArray:
-        """Return the covariance with which the points fit."""
-        known = np.isfinite(covariance)
+        stated = covariance[self.rows]
+        known = np.isfinite(stated)
+        doubtful, factor = bool(self.judgement.doubtful), self.judgement.factor
+        too_small = (doubtful or factor != 1.0) and np.where(known, stated, 0.0).any()
         if self.scatter and rescale:
-            return np.where(known, self.placed.points.stated, covariance)
-        fixed = not np.where(known, covariance, 0.0).any()
-        changes = bool(self.judgement.doubtful) or self.judgement.factor != 1.0
-        if fixed or not rescale or not changes or self.placed.model.estimated:
-            return covariance
-        factor = self.placed.model.factor()[0] if self.judgement.doubtful else self.judgement.factor
-        return np.where(known, factor**2 * covariance, covariance)
+            covariance[self.rows] = np.where(known, self.placed.points.stated, stated)
+        elif rescale and too_small and not self.placed.model.estimated:
+            factor = self.placed.model.factor()[0] if doubtful else factor
+            covariance[self.rows] = np.where(known, factor**2 * stated, stated)
+        return given.with_coordinate_covariance(covariance).select(keep)
 
 
 def plate_name(k: int) -> str:

@@ -159,18 +159,16 @@ class _Judge:
             return [Contradiction(name, out) for name, out in singled.items()]
         if judgement.factor != 1.0:
             return self._imprecise(tables, judgement.factor)
-        without = {name: self._without(tables, name) for name in rows}
+        without = {}  # probability of the observations of all other kinds, in place of those of a kind
+        for name in rows:
+            others = [table.kind for table in tables if table.kind.name != name]
+            without[name] = self.model(others)[0].kept().probability() if others else 1.0
         blamed = [name for name, probability in without.items() if probability >= self.level]
         rest = self._rest(tables, blamed[0]) if len(blamed) == 1 else None
         return [
             Contradiction(name, tuple(parts[k] for k in rows[name]), whole=True, rest=rest)
             for name in blamed or [max(without, key=lambda name: without[name])]
         ]
-
-    def _without(self, tables: Sequence[Table], name: str) -> float:
-        """Return the probability of the observations of all other kinds, in their place."""
-        others = [table.kind for table in tables if table.kind.name != name]
-        return self.model(others)[0].kept().probability() if others else 1.0
 
     def _rest(self, tables: Sequence[Table], name: str) -> int | None:
         """Return the degrees of freedom of the others, if these exceed those by which a kind contradicts.

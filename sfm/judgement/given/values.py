@@ -118,7 +118,16 @@ class Kept:
         if self.dof <= 0:
             return 1.0
         fall, rank = self.decreases()
-        of_rank = [self._sf_of_one(float(fall[rank == r].max()), int(r)) for r in np.unique(rank[rank > 0])]
+        of_rank = list[float]()
+        for r in np.unique(rank[rank > 0]).tolist():
+            largest, rest = float(fall[rank == r].max()), self.dof - r
+            if not self.model.estimated:
+                of_rank.append(self._sf(largest, r))
+            elif rest:  # the other values scatter at least as much as the network does
+                variance = max((self.chi2 - largest) / rest, 1.0)
+                of_rank.append(float(f_sf(largest / r / variance, r, rest)))
+            else:
+                of_rank.append(1.0)
         single = int((rank > 0).sum()) * min(of_rank) if of_rank else np.inf  # no value is checked alone
         if self.model.estimated:
             return min(1.0, single)
@@ -146,13 +155,6 @@ class Kept:
         """
         freedom = self.model.redundancy / max(self.model.share, 1e-3) ** 2
         return float(f_sf(chi2 / dof, dof, freedom))
-
-    def _sf_of_one(self, fall: float, rank: int) -> float:
-        """Return the probability of such a value; others scatter at least as much as the network does."""
-        rest = self.dof - rank
-        if not self.model.estimated:
-            return self._sf(fall, rank)
-        return float(f_sf(fall / rank / max((self.chi2 - fall) / rest, 1.0), rank, rest)) if rest else 1.0
 
 
 @dataclass(frozen=True)

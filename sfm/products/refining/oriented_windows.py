@@ -14,10 +14,10 @@ import numpy as np
 from sfm.adjustment.datum import Datum
 from sfm.adjustment.result import Adjustment
 from sfm.adjustment.solve import adjust
-from sfm.matching.correlation import LsmFlag, in_words
+from sfm.matching.correlation import LsmFlag
 from sfm.matching.lsm.coverage import points_apart
 from sfm.model.conventions import MAD_TO_SIGMA, BoolArray, FloatArray, IntArray
-from sfm.model.display import counted
+from sfm.model.display import counted, in_words
 from sfm.model.errors import GeometryError, SurveyFileError
 from sfm.model.estimate import Estimate
 from sfm.model.network import ImagePoints, Network, ObjectPoints, ScaleBars

@@ -12,9 +12,10 @@ import numpy as np
 from scipy.spatial import cKDTree
 
 from sfm.adjustment.result import Adjustment
-from sfm.judgement.survey_result import PhotographTargets, in_words
+from sfm.judgement.survey_result import PhotographTargets
 from sfm.matching.conjugate_patches import ConjugatePoints
 from sfm.model.conventions import AnyArray, FloatArray, IntArray
+from sfm.model.display import in_words
 from sfm.model.errors import PhotographError
 from sfm.model.network import Network
 from sfm.photographs.reading import read_photograph
@@ -278,12 +279,12 @@ def _legend(width: int, factor: float | None, photograph: PhotographTargets) -> 
     else:
         entries.append((f"residual, {factor:g} times as long", ARROW))
     entries += [
-        (f"x {in_words(str(reason.name).lower())}", colour)
+        (f"x {in_words(Flag, reason)}", colour)
         for reason, colour in REASON_COLOURS
         if (photograph.rejected_flag & reason.value).any()
     ]
     entries += [
-        (f"o {in_words(str(remark.name).lower())}", colour)
+        (f"o {in_words(Flag, remark)}", colour)
         for remark, colour in REMARK_COLOURS
         if (_remarks(photograph) & remark.value).any()
     ]
