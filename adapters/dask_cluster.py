@@ -29,7 +29,6 @@ from dask.distributed import (
     Future,
     KilledWorker,
     LocalCluster,
-    Scheduler,
     Worker,
     WorkerPlugin,
     get_worker,
@@ -130,7 +129,8 @@ def local_engine(workers: int) -> Iterator[DaskEngine]:
             stack.enter_context(cluster)
             client = stack.enter_context(Client(cluster))
             client.register_plugin(_LocalWorker())
-            client.run_on_scheduler(_close_pages)
+            # it would still list its pages, even if it does not show them
+            client.run_on_scheduler(lambda dask_scheduler: dask_scheduler.http_server.stop())
         yield DaskEngine(client)
 
 
@@ -219,10 +219,6 @@ class _LocalWorker(WorkerPlugin):
         """Run in every worker that starts, including the replacement of one that died."""
         signal.signal(signal.SIGINT, signal.SIG_IGN)
         worker.http_server.stop()
-
-
-def _close_pages(dask_scheduler: Scheduler) -> None:
-    dask_scheduler.http_server.stop()  # it would still list its pages, even if it does not show them
 
 
 @dataclass(frozen=True)

@@ -34,7 +34,8 @@ from sfm.files.whole_files import refuse_full, whole_file
 from sfm.model.camera import Camera
 from sfm.model.conventions import AnyArray, FloatArray, IntArray
 from sfm.model.errors import OutputError, SurveyFileError
-from sfm.model.network import ImagePoints, Network, rows_of
+from sfm.model.estimate import Estimate
+from sfm.model.network import ImagePoints, Network, empty_estimate, rows_of
 
 TABLES = ("cameras", "images", "keypoints", "matches", "two_view_geometries")
 HEADER_BYTES = 100
@@ -73,8 +74,8 @@ def write_database(path: Path, network: Network, cameras: tuple[Camera, ...]) ->
             raise OutputError(f"{path}: the database cannot be written: {reason_of(error)}") from error
 
 
-def read_database(path: Path) -> tuple[Network, tuple[Camera, ...]]:
-    """Read photographs and image points of a COLMAP database, with points from its matches.
+def read_database(path: Path) -> tuple[Network, Estimate]:
+    """Read cameras, photographs and image points of a COLMAP database, with points from its matches.
 
     Verified matches are used if there are any, otherwise the raw ones. Keypoints without a match are left
     out, and so are points that would appear twice in one photograph.
@@ -103,7 +104,7 @@ def read_database(path: Path) -> tuple[Network, tuple[Camera, ...]]:
             np.zeros(len(kept), dtype=bool),
         ),
     )
-    return network, tuple(as_opencv(camera_of(camera)) for camera in rows.cameras)
+    return network, empty_estimate(network, tuple(as_opencv(camera_of(camera)) for camera in rows.cameras))
 
 
 def _fill(pycolmap: Any, database: Any, network: Network, cameras: tuple[Camera, ...]) -> None:

@@ -93,7 +93,12 @@ def read_alicevision(path: Path) -> Content:
         pose = poses.get(view.text("poseId", view.text("viewId")))
         own = view.key("isPoseIndependant") is None or view.truth("isPoseIndependant")
         if pose is not None and view.key("rigId") and not own:
-            at = _place(view, stated)
+            rig_id, sub_pose = view.text("rigId"), _number(view, "subPoseId")
+            at = f"{rig_id} {sub_pose}"
+            if at not in stated.places:
+                raise view.error(
+                    f"{view.place}subPoseId is {sub_pose}, which is not in rig {shorten(rig_id)}"
+                )
             stated.on_rig[len(stated.images)] = (at, view.text("poseId", view.text("viewId")))
             (R, t), (R_rig, centre_rig) = stated.places[at], pose
             pose = R @ R_rig, centre_rig - R_rig.T @ R.T @ t
@@ -283,17 +288,6 @@ def _intrinsic(number: int, camera: Camera) -> dict[str, Any]:
 def _pose(tree: Tree) -> tuple[FloatArray, FloatArray]:
     """Return R (3, 3), object to camera axes, and centre (3,) of a transform."""
     return tree.numbers(("rotation",), 9).reshape(3, 3).T, tree.numbers(("center",), 3)
-
-
-def _place(view: Tree, stated: StatedModel) -> str:
-    """Return the place on its rig of a view whose rig has a pose."""
-    number = _number(view, "subPoseId")
-    place = f"{view.text('rigId')} {number}"
-    if place not in stated.places:
-        raise view.error(
-            f"{view.place}subPoseId is {number}, which is not in rig {shorten(view.text('rigId'))}"
-        )
-    return place
 
 
 def _number(tree: Tree, name: str) -> int:

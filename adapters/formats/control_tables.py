@@ -83,11 +83,14 @@ def read_given(folder: Path, network: Network) -> GivenValues:
             parameter, _, camera = name.partition(" of camera ")
             interior.append((camera, parameter, value, sigma))
     index = {name: j for j, name in enumerate(network.points)}
-    bars = [
-        (*ends, bar.value, bar.sigma)
-        for bar in given
-        if bar.kind == "scale bar" and (ends := _ends(bar.name, index)) is not None
-    ]
+    bars = []
+    for kind, name, _, value, sigma in given:
+        words = name.split(" - ") if kind == "scale bar" else []
+        for k in range(1, len(words)):  # names of points may contain dashes
+            first, second = " - ".join(words[:k]), " - ".join(words[k:])
+            if first in index and second in index:
+                bars.append((index[first], index[second], value, sigma))
+                break
     rows = np.array(bars, dtype=float).reshape(-1, 4)
     return GivenValues(
         ScaleBars(rows[:, 0].astype(np.int64), rows[:, 1].astype(np.int64), rows[:, 2], rows[:, 3]),
@@ -107,16 +110,6 @@ class _GivenValue(NamedTuple):
     coordinate: str
     value: float
     sigma: float
-
-
-def _ends(name: str, index: dict[str, int]) -> tuple[int, int] | None:
-    """Return the points of the bar `A - B`, whose names may contain dashes; None if one is missing."""
-    words = name.split(" - ")
-    for k in range(1, len(words)):
-        first, second = " - ".join(words[:k]), " - ".join(words[k:])
-        if first in index and second in index:
-            return index[first], index[second]
-    return None
 
 
 def _control(given: list[_GivenValue], network: Network) -> ObjectPoints:

@@ -97,21 +97,16 @@ def write_dxf(
         put((0, "LINE"), (8, _layer(line.layer)), *place(10, line.start), *place(11, line.end))
     for circle in circles:
         n = circle.normal / np.linalg.norm(circle.normal)
-        centre = _axes(n).T @ circle.centre  # in the axes of the entity
+        # in the axes of the entity, by the arbitrary axis algorithm
+        x = np.cross([0.0, 1.0, 0.0] if np.abs(n[:2]).max() < 1 / 64 else [0.0, 0.0, 1.0], n)
+        x /= np.linalg.norm(x)
+        centre = np.stack([x, np.cross(n, x), n], axis=1).T @ circle.centre
         put((0, "CIRCLE"), (8, _layer(circle.layer)), *place(10, centre), (40, float(circle.radius)))
         put(*place(210, n))
     for layer, text, at in texts:
         put((0, "TEXT"), (8, _layer(layer)), *place(10, at), (40, 1.5 * height), (1, _text(text)))
     put((0, "ENDSEC"), (0, "EOF"))
     write_lines(path, out)
-
-
-def _axes(n: FloatArray) -> FloatArray:
-    """Return the axes of an entity with normal n as columns, by the arbitrary axis algorithm."""
-    flat = abs(n[0]) < 1 / 64 and abs(n[1]) < 1 / 64
-    x = np.cross([0.0, 1.0, 0.0] if flat else [0.0, 0.0, 1.0], n)
-    x /= np.linalg.norm(x)
-    return np.stack([x, np.cross(n, x), n], axis=1)
 
 
 def _layer(name: str) -> str:

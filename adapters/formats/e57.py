@@ -61,8 +61,20 @@ def read_e57(path: Path) -> Content:
                 continue
             data = file.read_scan(k, ignore_missing_fields=True)
             scans.append(np.column_stack([np.asarray(data[axis], dtype=float) for axis in AXES]))
-            stated = set(header.point_fields).issuperset(SIGMAS) and len(scans[-1]) == header.point_count
-            sigmas.append(_read_fields(pye57, file, header, SIGMAS) if stated else None)
+            if not set(header.point_fields).issuperset(SIGMAS) or len(scans[-1]) != header.point_count:
+                sigmas.append(None)
+                continue
+            # pye57 knows no fields of standard deviations
+            values = [np.empty(header.point_count) for _ in SIGMAS]
+            buffers = pye57.libe57.VectorSourceDestBuffer()
+            for name, column in zip(SIGMAS, values, strict=True):
+                buffers.append(
+                    pye57.libe57.SourceDestBuffer(
+                        file.image_file, name, column, header.point_count, True, True
+                    )
+                )
+            header.points.reader(buffers).read()
+            sigmas.append(np.column_stack(values))
         root = file.image_file.root()
         crs = root["coordinateMetadata"].value() if root.isDefined("coordinateMetadata") else ""
     xyz = np.concatenate([np.zeros((0, 3)), *scans])
@@ -144,13 +156,3 @@ def _write_scan(lib: Any, image: Any, content: Content, columns: dict[str, Float
     writer = points.writer(buffers)
     writer.write(len(next(iter(arrays.values()))))
     writer.close()
-
-
-def _read_fields(pye57: Any, file: Any, header: Any, names: tuple[str, ...]) -> FloatArray:
-    """Return fields of a scan that pye57 does not know, (n, fields)."""
-    lib, count = pye57.libe57, header.point_count
-    arrays, buffers = [np.empty(count) for _ in names], pye57.libe57.VectorSourceDestBuffer()
-    for name, values in zip(names, arrays, strict=True):
-        buffers.append(lib.SourceDestBuffer(file.image_file, name, values, count, True, True))
-    header.points.reader(buffers).read()
-    return np.column_stack(arrays)

@@ -64,7 +64,7 @@ from sfm.model.display import counted
 from sfm.model.distortion.models import MODELS, Role
 from sfm.model.errors import KolinearError, OutputError, SurveyFileError
 from sfm.model.estimate import Estimate
-from sfm.model.network import Network, empty_estimate
+from sfm.model.network import Network
 from sfm.model.solution import Solution
 
 Reader = Callable[[Path], tuple[Network, Estimate]]
@@ -127,11 +127,6 @@ class FileFormat:
         return not self.only_points and (self.read is not None or self.read_all is not None)
 
 
-def _read_database(path: Path) -> tuple[Network, Estimate]:
-    network, cameras = read_database(path)
-    return network, empty_estimate(network, cameras)
-
-
 def _write_tables(folder: Path, content: Content) -> None:
     placed = select_placed(content)
     write_content_tables(folder, placed)
@@ -178,7 +173,7 @@ FORMATS = (
     FileFormat(
         name="colmap-database",
         models=_COLMAP,
-        read=_read_database,
+        read=read_database,
         write=lambda path, network, estimate: write_database(path, network, estimate.cameras),
         keeps=frozenset({"image points", "image names", "uncoded"}),
         names=(False, True),

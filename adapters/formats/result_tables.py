@@ -221,11 +221,18 @@ def read_content(folder: Path) -> Content:
     given = read_given(folder, network)
     control, checks = read_known_points(folder, network, given.control)
     cameras = _with_shared(result)
-    interior = [
-        (k, camera.names.index(parameter), value, sigma)
-        for owner, parameter, value, sigma in given.interior
-        for k, camera in [_first_of(folder, cameras, owner, parameter)]
-    ]
+    # each parameter belongs to a camera and to those that share it, of which the first observes it
+    column_of: dict[tuple[str, str], tuple[int, int]] = {}
+    for k, camera in enumerate(cameras):
+        for p, parameter in enumerate(camera.names):
+            column_of.setdefault((camera.owner_of(p), parameter), (k, p))
+    interior = []
+    for owner, parameter, value, sigma in given.interior:
+        if (owner, parameter) not in column_of:
+            raise SurveyFileError(
+                f"{folder}/given.csv: {parameter} of camera '{owner}', which is not in cameras.csv"
+            )
+        interior.append((*column_of[owner, parameter], value, sigma))
     rows = np.array(interior, dtype=float).reshape(-1, 4)
     network = network.with_given(
         control,
@@ -243,14 +250,6 @@ def read_content(folder: Path) -> Content:
         summary.sigma0,
         summary.sigma0_px,
     )
-
-
-def _first_of(folder: Path, cameras: tuple[Camera, ...], owner: str, parameter: str) -> tuple[int, Camera]:
-    """Return the first camera that a parameter belongs to."""
-    for k, camera in enumerate(cameras):
-        if parameter in camera.names and camera.owner_of(camera.names.index(parameter)) == owner:
-            return k, camera
-    raise SurveyFileError(f"{folder}/given.csv: {parameter} of camera '{owner}', which is not in cameras.csv")
 
 
 def _with_shared(result: Solution) -> tuple[Camera, ...]:

@@ -213,16 +213,15 @@ def _points(path: Path, frames: int) -> tuple[ImagePoints, FloatArray]:
                 )
             image.append(int(projection[0]))
             point.append(len(xyz) // 3)
-            if width == WITH_COVARIANCE and not _is_covariance(projection[3:7]):
+            xy.extend(projection[1:3])
+            stated.append(width == WITH_COVARIANCE)
+            xx, c_xy, c_yx, yy = projection[3:7] if stated[-1] else (SIGMA_PX**2, 0.0, 0.0, SIGMA_PX**2)
+            if not (c_xy == c_yx and xx > 0 and xx * yy - c_xy * c_yx > 0):
                 raise SurveyFileError(
                     f"{path}, line {number}: covariance {projection[3:7]} of frame {projection[0]:g} "
                     "is not symmetric and positive definite"
                 )
-            xy.extend(projection[1:3])
-            stated.append(width == WITH_COVARIANCE)
-            covariance.extend(
-                projection[3:7] if width == WITH_COVARIANCE else (SIGMA_PX**2, 0.0, 0.0, SIGMA_PX**2)
-            )
+            covariance.extend((xx, c_xy, c_yx, yy))
         xyz.extend(values[:3])
         if len(image) + len(xyz) // 3 > MAX_IMAGE_POINTS:
             raise SurveyFileError(
@@ -240,11 +239,6 @@ def _points(path: Path, frames: int) -> tuple[ImagePoints, FloatArray]:
         ),
         np.array(xyz).reshape(-1, 3),
     )
-
-
-def _is_covariance(values: list[float]) -> bool:
-    xx, xy, yx, yy = values
-    return xy == yx and xx > 0 and xx * yy - xy * yx > 0
 
 
 def _with_sigmas(image_points: ImagePoints, path: Path) -> ImagePoints:

@@ -184,9 +184,13 @@ def _with_rigs(stated: StatedModel, network: Network, estimate: Estimate) -> tup
     order = {place: k for k, place in enumerate(stated.places)}
     keys = sorted({*lens_and_place, *idle}, key=lambda key: (key[0], order.get(key[1], -1)))
     number, parts = {key: k for k, key in enumerate(keys)}, Counter(a for a, _ in keys)
-    cameras = tuple(
-        stated.cameras[a] if parts[a] == 1 else _mounted(stated.cameras[a], place) for a, place in keys
-    )
+    cameras = []
+    for a, place in keys:
+        camera = stated.cameras[a]
+        if parts[a] > 1:  # at several places, which share its interior orientation
+            shared = (camera.name,) * len(camera.names)
+            camera = replace(camera, name=f"{camera.name} {place}".strip(), shared=shared)
+        cameras.append(camera)
     mounts = _mounts(stated, [place for _, place in keys], rig_of)
     when: list[object] = [
         (rig_of[place_of[i]], stated.on_rig[i][1]) if i in place_of else i for i in range(len(stated.images))
@@ -195,13 +199,7 @@ def _with_rigs(stated: StatedModel, network: Network, estimate: Estimate) -> tup
     moment = np.array([moments[key] for key in when], dtype=np.int64)
     network = replace(network, camera=np.array([number[key] for key in lens_and_place], dtype=np.int64))
     refuse_moments(f"{stated.path}: rigs", [camera.name for camera in cameras], network, mounts, moment)
-    return replace(network, moment=moment), replace(estimate, cameras=cameras, mounts=mounts)
-
-
-def _mounted(camera: Camera, place: str) -> Camera:
-    """Return a camera at one of its places, which share its interior orientation."""
-    shared = (camera.name,) * len(camera.names)
-    return replace(camera, name=f"{camera.name} {place}".strip(), shared=shared)
+    return replace(network, moment=moment), replace(estimate, cameras=tuple(cameras), mounts=mounts)
 
 
 def _mounts(stated: StatedModel, places: list[str], rig_of: dict[str, int]) -> Mounts:

@@ -24,7 +24,7 @@ import numpy as np
 
 from adapters.reading.text_lines import Lines
 from sfm.files.plain_text import MAX_PIXEL_MM, MAX_SIDE_PX, as_plain, is_name
-from sfm.model.camera import Camera, camera_from_values
+from sfm.model.camera import camera_from_values
 from sfm.model.camera_file import CameraFile
 from sfm.model.errors import SurveyFileError
 
@@ -61,20 +61,25 @@ def read_australis(path: Path) -> CameraFile:
             entries[-1][2][words[0]] = side, pixel
         elif words and words[0] in PARAMETERS and len(words) == 6 and entries:
             entries[-1][1][PARAMETERS[words[0]]] = text.number_of(words[1 + FINAL])
-    cameras = tuple(_camera(path, *entry) for entry in entries)
-    if not cameras:
+    if not entries:
         raise SurveyFileError(f"{path}: no results for a camera are in this file of Australis")
-    return CameraFile(path.name, cameras, (None,) * len(cameras))
-
-
-def _camera(path: Path, name: str, values: dict[str, float], sides: dict[str, tuple[int, float]]) -> Camera:
-    if len(sides) != 2 or not values.get("c", 0.0) > 0:
-        what = "principal distance C" if len(sides) == 2 else "sensor size and pixel size (H and V)"
-        raise SurveyFileError(f"{path}: camera {as_plain(name)}: {what} is missing")
-    (width, sx), (height, sy) = sides["H"], sides["V"]
-    return camera_from_values(
-        name, "brown_affine", (width, height), (sx, sy), c_mm=values["c"], values=tuple(values.items())
-    )
+    cameras = []
+    for name, values, sides in entries:
+        if len(sides) != 2 or not values.get("c", 0.0) > 0:
+            what = "principal distance C" if len(sides) == 2 else "sensor size and pixel size (H and V)"
+            raise SurveyFileError(f"{path}: camera {as_plain(name)}: {what} is missing")
+        (width, sx), (height, sy) = sides["H"], sides["V"]
+        cameras.append(
+            camera_from_values(
+                name,
+                "brown_affine",
+                (width, height),
+                (sx, sy),
+                c_mm=values["c"],
+                values=tuple(values.items()),
+            )
+        )
+    return CameraFile(path.name, tuple(cameras), (None,) * len(cameras))
 
 
 def write_australis(path: Path, file: CameraFile) -> str:

@@ -59,7 +59,15 @@ def read_opencv(path: Path) -> CameraFile:
         SurveyFileError: no camera, without the size of its photographs, or not a model that is read.
     """
     tree = read_tree(path, WHAT)
-    size = _size(tree)
+    if tree.key(*WIDTH):
+        size = tree.sides(WIDTH, HEIGHT)
+    elif tree.key(*SIZE):
+        width, height = tree.numbers(SIZE, 2)
+        size = tree.side("width", width), tree.side("height", height)
+    else:  # as in OpenCV's own files of a pair
+        raise tree.error(
+            "the size of the photographs is missing, which a camera needs; add width and height to the file"
+        )
     pair = next((names for names in MATRICES if tree.key(names[0]) and tree.key(names[1])), None)
     rms = (tree.number(*RMS),) if tree.key(*RMS) else ()
     fisheye = tree.truth("fisheye", "fisheye_model")
@@ -87,18 +95,6 @@ def read_opencv(path: Path) -> CameraFile:
     return CameraFile(path.name, cameras, (None, None), mounts)
 
 
-def _size(tree: Tree) -> tuple[int, int]:
-    """Return width and height of the photographs, which OpenCV's own files of a pair do not state."""
-    if tree.key(*SIZE) and not tree.key(*WIDTH):
-        width, height = tree.numbers(SIZE, 2)
-        return tree.side("width", width), tree.side("height", height)
-    if not tree.key(*WIDTH):
-        raise tree.error(
-            "the size of the photographs is missing, which a camera needs; add width and height to the file"
-        )
-    return tree.sides(WIDTH, HEIGHT)
-
-
 def _camera(
     tree: Tree,
     name: str,
@@ -124,11 +120,8 @@ def write_opencv(path: Path, file: CameraFile) -> str:
         first, second = (
             Mounted.of(file.cameras[k], file.mounts, k) for k in next(iter(file.mounts.by_rig().values()))
         )
-        unit = file.unit or "unknown units"
-        content, remarks = _pair_content(
-            first, second, rectify(first.camera, second.camera, second.R, second.T)
-        )
-        remarks = (f"T is in {unit}: x2 = R x1 + T", *remarks)
+        rectified = rectify(first.camera, second.camera, second.R, second.T)
+        content, remarks = _pair_content(first, second, file.unit, rectified)
     else:
         camera = file.cameras[0]
         content = {"camera": camera.name, "width": camera.size_px[0], "height": camera.size_px[1]}
@@ -136,7 +129,11 @@ def write_opencv(path: Path, file: CameraFile) -> str:
         content |= {"K": matrix_of(camera), "D": np.array([coefficients_of(camera)])}
         content |= {"rms": file.rms_px[0]} if file.rms_px else {}
     if path.suffix.lower() == ".json":
-        values = {name: _as_json(M) if isinstance(M, np.ndarray) else M for name, M in content.items()}
+        values: dict[str, object] = dict(content)
+        for name, M in content.items():
+            if isinstance(M, np.ndarray):
+                shape, data = dict(zip(("rows", "cols"), M.shape, strict=True)), M.ravel().tolist()
+                values[name] = {"type_id": "opencv-matrix", **shape, "dt": "d", "data": data}
         return json.dumps(values, indent=1, allow_nan=False) + "\n"
     return "\n".join(_yaml_lines(content, remarks)) + "\n"
 
@@ -162,16 +159,16 @@ def pair_lines(
     Args:
         first: the reference camera, in model opencv.
         mounted: the second camera.
-        unit: unit of lengths.
+        unit: unit of lengths; empty if it is not known.
         rectified: the rectification that gave them, if they are rectified; otherwise theirs is computed.
     """
     rectified = rectified or rectify(first.camera, mounted.camera, mounted.R, mounted.T)
-    content, remarks = _pair_content(first, mounted, rectified)
-    yield from _yaml_lines(content, (f"T is in {unit}: x2 = R x1 + T", *remarks))
+    content, remarks = _pair_content(first, mounted, unit, rectified)
+    yield from _yaml_lines(content, remarks)
 
 
 def _pair_content(
-    first: Mounted, mounted: Mounted, rectified: Rectification | None
+    first: Mounted, mounted: Mounted, unit: str, rectified: Rectification | None
 ) -> tuple[dict[str, Entry], tuple[str, ...]]:
     """Return the entries of a pair of cameras, and what is to be remarked."""
     R, T, second = mounted.R, mounted.T, mounted.camera
@@ -183,10 +180,11 @@ def _pair_content(
     content |= {"K1": K1, "D1": np.array([coefficients_of(first.camera)])}
     content |= {"K2": K2, "D2": np.array([coefficients_of(second)])}
     content |= {"R": R, "T": T[:, None], "E": E, "F": F / (F[2, 2] or 1.0)}
+    remarks = (f"T is in {unit or 'unknown units'}: x2 = R x1 + T",)
     if rectified is None:
         apart = "no rectification: the viewing directions differ too much for a common image plane"
-        return content, (apart,)
-    return content | rectified._asdict(), ()
+        return content, (*remarks, apart)
+    return content | rectified._asdict(), remarks
 
 
 def _yaml_lines(content: dict[str, Entry], remarks: tuple[str, ...]) -> Iterator[str]:
@@ -200,8 +198,3 @@ def _yaml_lines(content: dict[str, Entry], remarks: tuple[str, ...]) -> Iterator
             yield f"{name}: {numbers_text([value])}"
         else:
             yield f"{name}: {json.dumps(value, ensure_ascii=False)}"
-
-
-def _as_json(M: FloatArray) -> dict[str, object]:
-    rows, cols = M.shape
-    return {"type_id": "opencv-matrix", "rows": rows, "cols": cols, "dt": "d", "data": M.ravel().tolist()}

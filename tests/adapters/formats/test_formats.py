@@ -253,10 +253,10 @@ def test_shuffled_files_are_refused_or_say_the_same(form: Format, tmp_path: Path
 def test_database_keeps_image_points_in_single_precision(tmp_path: Path) -> None:
     network, truth = network_in("opencv")
     write_database(tmp_path / "scene.db", network, truth.cameras)
-    again, cameras = read_database(tmp_path / "scene.db")
+    again, start = read_database(tmp_path / "scene.db")
     assert again.images == network.images
     assert len(again.points) == len(network.points)
-    np.testing.assert_allclose(cameras[0].parameters, truth.cameras[0].parameters, atol=1e-12)
+    np.testing.assert_allclose(start.cameras[0].parameters, truth.cameras[0].parameters, atol=1e-12)
     a, b = by_position(network), np.lexsort((again.image_points.xy[:, 0], again.image_points.image))
     a = np.lexsort((network.image_points.xy[:, 0], network.image_points.image))
     stored = (network.image_points.xy + 0.5).astype(np.float32).astype(float) - 0.5
