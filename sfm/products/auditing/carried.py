@@ -202,18 +202,14 @@ def _add_given(carried: Carried, given: Survey, images: Sequence[str]) -> None:
         if not rows.all():
             lost = int((~rows).sum())
             carried.of_survey.append(f"{counted(lost, 'row')} of [exterior] (no photograph of the model)")
-        carried.exterior = _selected(seen, rows) if rows.any() else None
+        if rows.any():
+            table = seen.table.select(rows)
+            kept = table.texts[table.names.index("image")]
+            carried.exterior = ObservedExterior(kept, seen.value[rows], seen.sigma[rows], table)
     for name, section in OTHER_SECTIONS.items():
         value = getattr(given, name)
         if value not in (None, ()) and value not in (TargetSettings(), CompareSettings()):
             carried.of_survey.append(section)
-
-
-def _selected(seen: ObservedExterior, rows: BoolArray) -> ObservedExterior:
-    """Return observed orientations of some photographs."""
-    table = seen.table.select(rows)
-    names = table.texts[table.names.index("image")]
-    return ObservedExterior(names, seen.value[rows], seen.sigma[rows], table)
 
 
 def _add_rigs_of_model(

@@ -180,11 +180,12 @@ def calibrate(result: SurveyResult, distances: Sequence[float] = ()) -> Calibrat
             raise GeometryError(f"distance {distance:g}, expected more than 0")
     adjustment = result.adjustment
     demanded = contradicted_parameters(adjustment)
-    cameras = tuple(
-        _camera_of(adjustment, k, demanded)
-        for k in _first_of_families(adjustment)
-        if adjustment.estimate.cameras[k].free.any()
-    )
+    network, lenses = adjustment.network, adjustment.estimate.cameras
+    _, family = camera_families(lenses, network.camera)
+    measured = np.unique(network.camera[network.image_points.image[~adjustment.rejected]])
+    # of cameras with common parameters, the first that has image points
+    first = measured[np.unique(family[measured], return_index=True)[1]]
+    cameras = tuple(_camera_of(adjustment, k, demanded) for k in first.tolist() if lenses[k].free.any())
     if not cameras:
         raise GeometryError(
             f"survey {result.survey}: no camera was adjusted, so that nothing is calibrated; free its "
@@ -206,15 +207,6 @@ def calibrate(result: SurveyResult, distances: Sequence[float] = ()) -> Calibrat
         level,
         remarks,
     )
-
-
-def _first_of_families(adjustment: Adjustment) -> tuple[int, ...]:
-    """Return the first camera with image points of each family of cameras with common parameters."""
-    network = adjustment.network
-    names, family = camera_families(adjustment.estimate.cameras, network.camera)
-    measured = np.unique(network.camera[network.image_points.image[~adjustment.rejected]])
-    members = (measured[family[measured] == number] for number in range(len(names)))
-    return tuple(int(of_family[0]) for of_family in members if len(of_family))
 
 
 def _camera_of(adjustment: Adjustment, k: int, demanded: Sequence[tuple[str, str]]) -> CameraCalibration:

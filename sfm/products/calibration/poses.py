@@ -38,7 +38,7 @@ from sfm.model.camera import (
     ray_jacobian,
     rays_from_pixel,
 )
-from sfm.model.conventions import FloatArray, IntArray, skew
+from sfm.model.conventions import FloatArray, IntArray, rotation_from_angles, skew
 from sfm.model.network import ImagePoints
 from sfm.products.calibration.projection import (
     ProjectionUncertainty,
@@ -160,7 +160,7 @@ def candidates(adjustment: Adjustment, camera: int) -> Iterator[Pose]:
     places = [(x, y) for x, y in product(PLACES, PLACES)]
     rays = rays_from_pixel(lens, np.array(places) * (width, height) - 0.5)
     for a, b, roll, distance in product(TILTS_DEG, TILTS_DEG, ROLLS_DEG, distances):
-        rotation = facing @ _turned(np.radians(a), np.radians(b), np.radians(roll))
+        rotation = facing @ rotation_from_angles(np.radians(a), np.radians(b), np.radians(roll))
         for place, ray in zip(places, rays, strict=True):
             if not np.isfinite(ray).all():
                 continue
@@ -173,15 +173,6 @@ def candidates(adjustment: Adjustment, camera: int) -> Iterator[Pose]:
             xy[shown[inside]] = all_xy[inside]
             if np.isfinite(xy[:, 0]).sum() >= least:
                 yield Pose(position, rotation, (a, b), roll, place, float(distance), xy)
-
-
-def _turned(a: float, b: float, roll: float) -> FloatArray:
-    """Return the rotation about the x axis, the y axis and the axis of the camera, rad, (3, 3)."""
-    ca, sa, cb, sb, ck, sk = np.cos(a), np.sin(a), np.cos(b), np.sin(b), np.cos(roll), np.sin(roll)
-    x = np.array([[1, 0, 0], [0, ca, -sa], [0, sa, ca]])
-    y = np.array([[cb, 0, sb], [0, 1, 0], [-sb, 0, cb]])
-    z = np.array([[ck, -sk, 0], [sk, ck, 0], [0, 0, 1]])
-    return np.asarray(x @ y @ z)
 
 
 def with_poses(adjustment: Adjustment, camera: int, poses: Sequence[Pose]) -> Adjustment:

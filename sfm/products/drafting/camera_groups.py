@@ -91,7 +91,7 @@ def group_photographs(
         others: names of further files there, which no glob of a camera shall match.
     """
     named = cameras_in_names(sorted(metadata))
-    if named is not None and (_is_one_camera(named, metadata) or _are_apart(named, metadata)):
+    if named is not None and _are_contradicted(named, metadata):
         named = None
     part = {} if named is None else dict(named.camera)
     kept, left_out = _divide(metadata, part)
@@ -142,26 +142,22 @@ def _divide(
     return kept, left_out
 
 
-def _is_one_camera(named: NamedCameras, metadata: Mapping[str, Metadata]) -> bool:
-    """Return whether serial numbers show that one camera took what the names give to several."""
-    of: dict[object, set[str]] = defaultdict(set)
+def _are_contradicted(named: NamedCameras, metadata: Mapping[str, Metadata]) -> bool:
+    """Return whether serial numbers or times contradict that the names give cameras of one moment.
+
+    One camera took what the names give to several, or its photographs are not taken together: the clocks of
+    cameras differ by a constant, and a camera that is carried on has no constant difference.
+    """
+    parts: dict[object, set[str]] = defaultdict(set)
+    of: dict[str, dict[str, float]] = defaultdict(dict)
     for name, part in named.camera.items():
         exif = metadata[name]
         if exif.serial:
-            of[exif.make, exif.model, exif.serial].add(part)
-    return any(len(parts) > 1 for parts in of.values())
-
-
-def _are_apart(named: NamedCameras, metadata: Mapping[str, Metadata]) -> bool:
-    """Return whether the times of exposure contradict that the cameras take photographs together.
-
-    The clocks of cameras differ by a constant. A camera that is carried on has no constant difference.
-    """
-    of: dict[str, dict[str, float]] = defaultdict(dict)
-    for name, part in named.camera.items():
-        taken = metadata[name].taken
-        if taken is not None:
-            of[part][named.moment[name]] = taken.timestamp()
+            parts[exif.make, exif.model, exif.serial].add(part)
+        if exif.taken is not None:
+            of[part][named.moment[name]] = exif.taken.timestamp()
+    if any(len(of_one_body) > 1 for of_one_body in parts.values()):
+        return True
     reference, *others = sorted(of.values(), key=len, reverse=True) or [{}]
     for times in others:
         ahead = np.array([times[moment] - reference[moment] for moment in times if moment in reference])

@@ -214,10 +214,32 @@ class _Seen:
 
 
 def _try_tags_and_boards(seen: _Seen, more: Sequence[Path], progress: Progress) -> None:
-    tags, seen.plates = _tags_and_boards(seen.greys, more, seen.files, progress)
-    if tags and not seen.plates:
-        seen.measured = seen.plain if tags == seen.tags else seen.measure(tags)
-        seen.counts[tags] = _repeated_codes([targets.code for targets in seen.measured])
+    """Search boards, and the dictionary of tags that photographs have in common.
+
+    Tags on a checkerboard show that it is a ChArUco board.
+    """
+    tried = list(seen.greys.values())
+    others = [_as_bytes(seen.files.read(path)) for path in more if path not in seen.greys]
+    seen.plates = search_april_grids(tried, others)  # first, since modules of tags may look like squares
+    if seen.plates:
+        return
+    plate = search_checkerboard([*tried, *others])
+    seen.plates = () if plate is None else (plate,)
+    progress.advance("boards")
+    read = [read_dictionaries(photograph) for photograph in tried]
+    if any(read):
+        read += [read_dictionaries(photograph) for photograph in others]
+    progress.advance("tags")
+    family, largest = _shared_family(read)
+    if not family:
+        return
+    tags = [read_tags.get(largest, NO_TAGS) for read_tags in read]
+    charuco = search_charuco([*tried, *others], family, tags)
+    if charuco is not None:
+        seen.plates = (charuco,)
+    if not seen.plates:
+        seen.measured = seen.plain if family == seen.tags else seen.measure(family)
+        seen.counts[family] = _repeated_codes([targets.code for targets in seen.measured])
 
 
 def _try_dots(seen: _Seen, others: Sequence[Path]) -> None:
@@ -365,33 +387,6 @@ def _largest_lattice(photographs: Sequence[Targets]) -> tuple[int, int] | None:
         size for targets in photographs if (size := lattice_size(targets.xy[targets.is_circle])) is not None
     ]
     return max(sizes, key=lambda size: size[0] * size[1], default=None)
-
-
-def _tags_and_boards(
-    read_already: Mapping[Path, AnyArray], more: Sequence[Path], files: _Files, progress: Progress
-) -> tuple[str, tuple[PlateFamily, ...]]:
-    """Return the dictionary of tags that photographs have in common, "" if none, and their boards.
-
-    Tags on a checkerboard show that it is a ChArUco board.
-    """
-    tried = list(read_already.values())
-    others = [_as_bytes(files.read(path)) for path in more if path not in read_already]
-    grids = search_april_grids(tried, others)  # first, since modules of tags may look like squares
-    if grids:
-        return "", grids
-    plate = search_checkerboard([*tried, *others])
-    boards = () if plate is None else (plate,)
-    progress.advance("boards")
-    read = [read_dictionaries(photograph) for photograph in tried]
-    if any(read):
-        read += [read_dictionaries(photograph) for photograph in others]
-    progress.advance("tags")
-    family, largest = _shared_family(read)
-    if not family:
-        return "", boards
-    seen = [tags.get(largest, NO_TAGS) for tags in read]
-    charuco = search_charuco([*tried, *others], family, seen)
-    return family, boards if charuco is None else (charuco,)
 
 
 def _shared_family(read: Sequence[Tags]) -> tuple[str, str]:

@@ -15,6 +15,7 @@ from sfm.model.conventions import FloatArray
 from sfm.model.display import counted
 from sfm.model.distortion.models import MODELS
 from sfm.model.errors import SurveyFileError
+from sfm.products.planning.stations import aim_camera
 from sfm.products.rendering.scene import (
     UNCODED,
     CircularTargets,
@@ -213,7 +214,10 @@ def read_scene(path: Path) -> Staging:
         c_mm=file.camera.c_mm,
         values=tuple(file.camera.values.items()),
     )
-    stations = [_rotation(station) for station in file.station]
+    stations = [
+        aim_camera(np.subtract(station.look_at, station.position), np.radians(station.roll_deg))
+        for station in file.station
+    ]
     return Staging(
         scene,
         camera,
@@ -290,17 +294,3 @@ def _place_grid(
             turn = np.radians(grid.turn_deg)
             marks.append(coded_ring(face, at, grid.radius, code, family, grid.reflectance, turn=turn))
         targets.append((face, x, y, grid.radius, code or UNCODED))
-
-
-def _rotation(station: _Station) -> FloatArray:
-    """Return R of a camera that looks at a point; with roll 0 the x axis of the image is horizontal."""
-    away = np.subtract(station.position, station.look_at)
-    z = away / np.linalg.norm(away)
-    right = np.cross([0.0, 0.0, 1.0], z)
-    if np.linalg.norm(right) < 1e-9:  # looking straight down: x of the image along X
-        right = np.array([1.0, 0.0, 0.0])
-    x = right / np.linalg.norm(right)
-    roll = np.radians(station.roll_deg)
-    y = np.cross(z, x)
-    turned = np.cos(roll) * x + np.sin(roll) * y
-    return np.column_stack([turned, np.cross(z, turned), z])

@@ -13,7 +13,7 @@ import sfm
 from sfm.judgement.survey_result import SurveyResult
 from sfm.model.errors import GeometryError
 from sfm.model.remarks.remark import kinds_of, of_kind
-from sfm.products.calibration.calibration import Calibration, _first_of_families, calibrate
+from sfm.products.calibration.calibration import Calibration, calibrate
 from sfm.products.calibration.crossvalidation import cross_validate
 from sfm.products.calibration.page import page, verdict_of
 from sfm.report.pages import html, text
@@ -160,8 +160,12 @@ def test_a_camera_whose_photographs_show_nothing_has_no_calibration(sound: Calib
         position=np.vstack([a.estimate.position, np.full(3, np.nan)]),
         rotation=np.concatenate([a.estimate.rotation, np.full((1, 3, 3), np.nan)]),
     )
-    further = replace(a, network=network, estimate=estimate)
-    assert _first_of_families(further) == (0,)
+    (seen,) = a.covariance.interior
+    unknown = np.diag(np.full(len(seen), np.inf))
+    covariance = replace(a.covariance, interior=(seen, unknown))
+    further = replace(a, network=network, estimate=estimate, covariance=covariance)
+    calibrated = calibrate(replace(sound.result, adjustment=further), (sound.distances[0],))
+    assert [camera.name for camera in calibrated.cameras] == ["cam"]
     assert len(cross_validate(further).of_camera("cam")) == 4  # the blind one does not hinder the other
 
 

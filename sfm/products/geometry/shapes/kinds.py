@@ -15,6 +15,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass, replace
+from functools import partial
 
 import numpy as np
 
@@ -46,14 +47,10 @@ class Kind:
         return len(self.moves) + len(self.form)
 
 
-def _line(y: FloatArray, q: FloatArray) -> Distances:
-    g = np.broadcast_to(np.eye(3)[:2], (len(y), 2, 3))
-    return y[:, :2], g, np.zeros((len(y), 2, 0))
-
-
-def _plane(y: FloatArray, q: FloatArray) -> Distances:
-    g = np.broadcast_to(np.eye(3)[2:], (len(y), 1, 3))
-    return y[:, 2:], g, np.zeros((len(y), 1, 0))
+def _straight(across: slice, y: FloatArray, q: FloatArray) -> Distances:
+    """Return the coordinates across a line or a plane as its distances."""
+    d, axes = y[:, across], np.eye(3)[across]
+    return d, np.broadcast_to(axes, (len(y), len(axes), 3)), np.zeros((len(y), len(axes), 0))
 
 
 def _radial(y: FloatArray) -> tuple[FloatArray, FloatArray]:
@@ -179,8 +176,8 @@ SHIFTS, TILTS = (0, 1, 2), (3, 4)
 KINDS = {
     kind.name: kind
     for kind in (
-        Kind("line", "point", (), (0, 1, *TILTS), 2, 2, _line),
-        Kind("plane", "point", (), (2, *TILTS), 1, 3, _plane),
+        Kind("line", "point", (), (0, 1, *TILTS), 2, 2, partial(_straight, slice(0, 2))),
+        Kind("plane", "point", (), (2, *TILTS), 1, 3, partial(_straight, slice(2, 3))),
         Kind("circle", "centre", ("radius",), (*SHIFTS, *TILTS), 2, 3, _circle),
         Kind("ellipse", "centre", ("semi_major", "semi_minor"), (*SHIFTS, *TILTS, 5), 2, 5, _ellipse),
         Kind("sphere", "centre", ("radius",), SHIFTS, 1, 4, _sphere),
