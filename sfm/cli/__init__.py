@@ -82,10 +82,7 @@ def _run() -> None:
 
 def _refuse(message: str, *, code: int = BAD_INPUT) -> None:
     """Print one line and exit with a code."""
-    print(f"kolinear: {_printable(message)}", file=sys.stderr)
+    # without the control characters that a file name may contain
+    line = "".join(c if c.isprintable() else " " for c in message)
+    print(f"kolinear: {line}", file=sys.stderr)
     raise SystemExit(code) from None
-
-
-def _printable(text: str) -> str:
-    """Return a message on one line, without the control characters that a file name may contain."""
-    return "".join(c if c.isprintable() else " " for c in text)

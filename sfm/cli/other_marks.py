@@ -64,10 +64,12 @@ def read_marks_of_others(
             points = read_ground_control(path, ControlSettings(file=path.name), unit).points
             known = [bool(np.isfinite(xyz).all()) for xyz in points.xyz]
             control = _stated(points.names, points.xyz, points.sigma, known)
-        rows = [
-            (image, point, *_in_pixels(xy, seen.unit, size_of.get(image)), SIGMA_PX**2 * np.eye(2))
-            for image, point, xy in zip(seen.image, seen.point, seen.xy, strict=True)
-        ]
+        rows = []
+        for image, point, xy in zip(seen.image, seen.point, seen.xy, strict=True):
+            place = np.array([xy], dtype=float)
+            if seen.unit != "px" and image in size_of:  # parts of the longer side from the middle
+                place = pixel_from_longer_side(place, np.array([size_of[image]], dtype=float))
+            rows.append((image, point, float(place[0, 0]), float(place[0, 1]), SIGMA_PX**2 * np.eye(2)))
     elif ending in (".xml", ".db"):
         network, _ = read_any(path, ENDINGS[ending])
         given = network.control.complete
@@ -117,14 +119,6 @@ def _stated(
         for name, place, s, keep in zip(names, xyz.tolist(), sigma.tolist(), kept, strict=True)
         if keep
     }
-
-
-def _in_pixels(xy: Sequence[float], unit: str, size: tuple[int, int] | None) -> tuple[float, float]:
-    """Return a position in px, of parts of the longer side from the middle if that is the unit."""
-    place = np.array([xy], dtype=float)
-    if unit != "px" and size is not None:
-        place = pixel_from_longer_side(place, np.array([size], dtype=float))
-    return float(place[0, 0]), float(place[0, 1])
 
 
 def write_marks_of_others(

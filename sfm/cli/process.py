@@ -33,14 +33,21 @@ def loading() -> Iterator[None]:
     """Run the imports of a command, which take a second, so that Ctrl-C ends the program at once.
 
     No output is begun yet that could be left incomplete. An exception would be swallowed by Python's import
-    system, or would leave it as an ImportError. After the imports, compiling of kernels is announced.
+    system, or would leave it as an ImportError. After the imports, compiling of kernels is announced as
+    long as the command runs, if numba is loaded.
     """
     before = signal.getsignal(signal.SIGINT)
     if before is not signal.SIG_IGN:
         signal.signal(signal.SIGINT, _end)
     try:
         yield
-        _announce_compiling()
+        if "numba" in sys.modules and not _listening:
+            from sfm.runtime.compiling import COMPILING, when_compiling
+
+            _listening.append(True)
+            _running.enter_context(
+                when_compiling(lambda: print(f"kolinear: the {COMPILING}", file=sys.stderr, flush=True))
+            )
     finally:
         signal.signal(signal.SIGINT, before)
 
@@ -79,17 +86,6 @@ def _end(number: int, frame: FrameType | None, *, text: str = INTERRUPTED_TEXT) 
     """Exit at once, without waiting for threads or cleaning up."""
     os.write(2, f"{text}\n".encode())
     os._exit(INTERRUPTED)
-
-
-def _announce_compiling() -> None:
-    """Report compiling of kernels on stderr while the command runs, if numba is loaded."""
-    if "numba" in sys.modules and not _listening:
-        from sfm.runtime.compiling import COMPILING, when_compiling
-
-        _listening.append(True)
-        _running.enter_context(
-            when_compiling(lambda: print(f"kolinear: the {COMPILING}", file=sys.stderr, flush=True))
-        )
 
 
 def compile_first() -> None:

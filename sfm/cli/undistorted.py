@@ -258,7 +258,9 @@ def _draw_pairs(
         inside = target if len(pairs) == 1 else target / _file_name(title)
         inside.mkdir(exist_ok=True)
         path = inside / f"rectified-{_file_name(title)}.yaml"
-        path.write_text("\n".join(_pair_lines(pair, file.unit)) + "\n", encoding="utf-8", newline="")
+        second = Mounted(pair.second.camera, np.eye(3), pair.base)
+        yaml = pair_lines(alone(pair.first.camera), second, file.unit, rectified=pair.rectification)
+        path.write_text("\n".join(yaml) + "\n", encoding="utf-8", newline="")
         words = (
             f"{title}: {counted(len(common), 'pair')} as {of[0][common[0]]} and {of[1][common[0]]}, new "
             f"cameras, R1, R2, P1, P2 and Q in {path.name}"
@@ -278,15 +280,6 @@ def _draw_pairs(
         progress.advance()
     left = len(names) - len({name for _, name, _ in shots})
     return [*lines, *([f"{counted(left, 'photograph')} without a partner left out"] if left else [])]
-
-
-def _pair_lines(pair: RectifiedPair, unit: str) -> Sequence[str]:
-    """Return the file of a rectified pair: two cameras without distortion, and how they were rectified."""
-    second = Mounted(pair.second.camera, np.eye(3), pair.base)
-    lines = pair_lines(
-        alone(pair.first.camera), second, unit or "unknown units", rectified=pair.rectification
-    )
-    return list(lines)
 
 
 def _draw(draw: UndistortedPhotographs, path: Path, view: View, out: Path) -> None:

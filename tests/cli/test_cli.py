@@ -9,6 +9,7 @@ import signal
 import subprocess
 import sys
 import time
+from contextlib import nullcontext
 from importlib.metadata import version
 from pathlib import Path
 
@@ -17,11 +18,11 @@ import numpy as np
 import pytest
 from typer.testing import CliRunner
 
-from sfm import cli
 from sfm.cli import app, process
 from sfm.products.rendering.render import write_photographs
 from sfm.products.rendering.scene_file import read_scene
 from sfm.report.output import write_result
+from sfm.runtime import compiling
 from tests.commands import kolinear, refused
 from tests.engines import PLOTLESS
 from tests.places import ROOT
@@ -102,7 +103,7 @@ codes = [0, 11, 0, 0]
 @pytest.fixture(autouse=True)
 def compiled(monkeypatch: pytest.MonkeyPatch) -> None:
     """Compiling is not reported, whether or not this is the first run after a change."""
-    monkeypatch.setattr(process, "_announce_compiling", lambda: None)
+    monkeypatch.setattr(compiling, "when_compiling", lambda _: nullcontext())
 
 
 @pytest.fixture(scope="module")
@@ -398,8 +399,8 @@ def test_a_shell_completes_commands_and_options(shell: str) -> None:
     assert "kolinear" in ask("", "source")
 
 
-def test_messages_stay_on_one_line() -> None:
-    assert cli._printable("a\nb\x1b[31m\tc") == "a b [31m c"
+def test_messages_stay_on_one_line(capsys: pytest.CaptureFixture[str], tmp_path: Path) -> None:
+    assert f"{tmp_path}/a b [31m c.toml: " in refused(capsys, "run", tmp_path / "a\nb\x1b[31m\tc.toml")
 
 
 def test_a_name_that_the_terminal_cannot_show_is_no_fault(tmp_path: Path) -> None:

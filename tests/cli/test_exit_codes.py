@@ -6,17 +6,18 @@ import os
 import subprocess
 import sys
 from collections.abc import Callable
+from contextlib import nullcontext
 from pathlib import Path
 from typing import Any, NoReturn
 
 import cv2
 import pytest
 
-from sfm.cli import process
 from sfm.cli.app import COMMANDS
 from sfm.model.errors import KolinearError
 from sfm.products.batch.run import run_batch
 from sfm.report.output import read_log
+from sfm.runtime import compiling
 from sfm.runtime.faults import error_in_words, is_fault, working_on
 from tests.commands import command_of, kolinear
 from tests.engines import ALONE, HERE, PLOTLESS, Notes
@@ -44,7 +45,7 @@ def line_of(words: str) -> tuple[str, ...]:
 
 @pytest.fixture(autouse=True)
 def compiled(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(process, "_announce_compiling", lambda: None)
+    monkeypatch.setattr(compiling, "when_compiling", lambda _: nullcontext())
 
 
 def run(capsys: pytest.CaptureFixture[str], *arguments: object) -> tuple[int, list[str]]:
