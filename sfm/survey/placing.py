@@ -221,7 +221,16 @@ def place_on_exterior(network: Network, estimate: Estimate) -> Estimate:
     ):
         similarity = fit_similarity(source, target, weights=weight)
     else:
-        raise GeometryError(_too_few(len(target), 0, f", {_arrangement(length, breadth, noise)}"))
+        if length == 0:
+            how = "all the same"
+        elif length > MIN_OFF_LINE_SIGMAS * noise and breadth <= max(noise, MIN_OFF_LINE_FRACTION * length):
+            how = "on a line"  # no broader than their errors
+        else:
+            how = (
+                f"of RMS extents {length / noise:.1f} and {breadth / noise:.1f} standard deviations, needed "
+                f"{MIN_OFF_LINE_SIGMAS:g} in both directions"
+            )
+        raise GeometryError(_too_few(len(target), 0, f", {how}"))
     return similarity.apply_estimate(estimate)
 
 
@@ -272,20 +281,6 @@ def _extents(places: FloatArray, weight: FloatArray) -> tuple[float, float]:
     w = weight / weight.sum()
     spread = np.linalg.svd((places - w @ places) * np.sqrt(w)[:, None], compute_uv=False)
     return float(spread[0]), float(spread[1])
-
-
-def _arrangement(length: float, breadth: float, noise: float) -> str:
-    """Describe the arrangement of positions that do not determine the network's attitude."""
-    if length == 0:
-        return "all the same"
-    if length > MIN_OFF_LINE_SIGMAS * noise and breadth <= max(
-        noise, MIN_OFF_LINE_FRACTION * length
-    ):  # no broader than their errors
-        return "on a line"
-    return (
-        f"of RMS extents {length / noise:.1f} and {breadth / noise:.1f} standard deviations, needed "
-        f"{MIN_OFF_LINE_SIGMAS:g} in both directions"
-    )
 
 
 def _too_few(places: int, turned: int, how: str = "") -> str:

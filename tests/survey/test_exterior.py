@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+from contextlib import nullcontext
 from dataclasses import replace
 from pathlib import Path
 
@@ -216,7 +217,14 @@ def test_control_places_a_network_from_a_twentieth_of_its_length(
 
 @pytest.mark.parametrize(("breadth", "on_a_line"), [(0.8e-6, True), (1.5e-6, False)])
 def test_places_are_on_a_line_within_a_millionth_of_their_extent(breadth: float, on_a_line: bool) -> None:
-    assert (placing._arrangement(1.0, breadth, 1e-9) == "on a line") is on_a_line
+    b = breadth
+    figure = np.array([[-1, -b, 0], [1, -b, 0], [1, b, 0], [-1, b, 0]])
+    network, truth = make_network(seed_of("line"), images=3, points=4, free=(), figure=figure)
+    control = ObjectPoints(np.arange(4), truth.points + 3.0, np.zeros((4, 3, 3)))
+    refused = pytest.raises(GeometryError, match="on a line")
+    with refused if on_a_line else nullcontext():
+        found = placing.place_on_exterior(network.with_given(control), truth)
+        np.testing.assert_allclose(found.points, control.xyz, atol=1e-9)
 
 
 def test_a_control_datum_needs_control_or_exterior(tmp_path: Path) -> None:

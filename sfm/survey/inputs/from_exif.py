@@ -11,9 +11,9 @@ import numpy as np
 from sfm.files.csv_tables import array_table
 from sfm.model.conventions import METRES
 from sfm.model.display import counted
-from sfm.model.errors import PhotographError, SurveyFileError
+from sfm.model.errors import SurveyFileError
 from sfm.model.remarks.remark import Remark, remark
-from sfm.photographs.exif import LocalSystem, SatellitePosition, local_coordinates, read_metadata
+from sfm.photographs.exif import LocalSystem, SatellitePosition, local_coordinates
 from sfm.survey.inputs.exterior_table import ObservedExterior
 from sfm.survey.inputs.given_values import AXES
 from sfm.survey.inputs.measurements import PhotographList
@@ -36,13 +36,10 @@ def exterior_from_exif(survey: Survey, files: PhotographList) -> tuple[Survey, t
     if survey.exif_sigma_m is None:
         return survey, ()
     positions: dict[str, SatellitePosition] = {}
-    for name, path in zip(files.names, files.paths, strict=True):
-        try:
-            position = read_metadata(path).position
-        except PhotographError:
-            continue  # reported when it is measured
-        if position is not None:
-            positions[name] = position
+    for k, name in enumerate(files.names):
+        metadata = files.metadata_of(k)
+        if metadata is not None and metadata.position is not None:
+            positions[name] = metadata.position
     if not positions:
         raise SurveyFileError(
             f"{survey.source}: [exterior] exif_sigma_m asks for positions in EXIF data, and none of "
@@ -145,18 +142,16 @@ def named_moments(times: Mapping[str, datetime], tolerance_s: float) -> dict[str
 def _times(camera: int, files: PhotographList, where: str) -> dict[str, datetime]:
     """Return the times of the photographs of a camera by its clock, by name."""
     times: dict[str, datetime] = {}
-    for k in np.flatnonzero(files.camera == camera):
-        name, path = files.names[k], files.paths[k]
-        try:
-            taken = read_metadata(path).taken
-        except PhotographError:
-            continue  # reported when it is measured
-        if taken is None:
+    for k in np.flatnonzero(files.camera == camera).tolist():
+        name, metadata = files.names[k], files.metadata_of(k)
+        if metadata is None:
+            continue
+        if metadata.taken is None:
             raise SurveyFileError(
                 f"{where}: moment = 'exif', and photograph '{name}' states no time in its EXIF data; "
                 "needed a table or an expression that names the moments, or 'order'"
             )
-        times[name] = taken
+        times[name] = metadata.taken
     return times
 
 

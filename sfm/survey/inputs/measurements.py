@@ -45,6 +45,13 @@ class PhotographList:
         """Return the paths of the photographs, by their names."""
         return dict(zip(self.names, self.paths, strict=True))
 
+    def metadata_of(self, k: int) -> Metadata | None:
+        """Return the metadata of a photograph; None if it cannot be read, which is reported at measuring."""
+        try:
+            return read_metadata(self.paths[k])
+        except PhotographError:
+            return None
+
     def by_camera(self) -> tuple[tuple[str, ...], ...]:
         """Return the names of the photographs of each camera that has any."""
         return tuple(

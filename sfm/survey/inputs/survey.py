@@ -304,6 +304,12 @@ def survey_of_file(file: SurveyFile) -> Survey:
     control = (
         read_ground_control(file.beside(file.control.file), file.control, file.unit) if file.control else None
     )
+    bars = tuple(ScaleBar(bar.start, bar.end, bar.length, bar.sigma) for bar in file.scale_bars)
+    bars += equipment.bars
+    if marking is not None:  # a person states bars in the marks file in place of the same ones
+        stated = {frozenset(ends) for ends in marking.bars}
+        kept = (bar for bar in bars if frozenset((bar.start, bar.end)) not in stated)
+        bars = (*kept, *marking.bars.values())
     return Survey(
         name=file.name,
         unit=file.unit,
@@ -334,11 +340,7 @@ def survey_of_file(file: SurveyFile) -> Survey:
         )
         + equipment.frames,
         equipment=equipment.placed,
-        scale_bars=_with_stated_bars(
-            tuple(ScaleBar(bar.start, bar.end, bar.length, bar.sigma) for bar in file.scale_bars)
-            + equipment.bars,
-            marking,
-        ),
+        scale_bars=bars,
         observations=_given_image_points(file, control, marking),
         marks=file.marks,
         refused=() if marking is None else marking.left_out,
@@ -370,15 +372,6 @@ def _marking_of(file: SurveyFile) -> Marking | None:
             f"{path}: has the marks of survey '{marking.survey}', but {file.source} is '{file.name}'"
         )
     return marking
-
-
-def _with_stated_bars(bars: tuple[ScaleBar, ...], marking: Marking | None) -> tuple[ScaleBar, ...]:
-    """Return the scale bars, with those that a person states in the marks file in place of the same ones."""
-    if marking is None:
-        return bars
-    stated = {frozenset(ends) for ends in marking.bars}
-    kept = (bar for bar in bars if frozenset((bar.start, bar.end)) not in stated)
-    return (*kept, *marking.bars.values())
 
 
 def _with_stated(control: KnownPoints | None, marking: Marking | None) -> KnownPoints | None:

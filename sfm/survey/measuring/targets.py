@@ -83,13 +83,10 @@ def measure_photographs(
         )  # first: it reports faults of a file best
         return read_metadata(path), targets, stored
 
-    def picture(read: tuple[Metadata, Targets, bool]) -> bytes:
-        return read[1].xy.tobytes() if len(read[1]) >= MIN_COMMON else b""
-
     measured, failed = each_photograph(
         photographs,
         read_and_measure,
-        picture=picture,
+        places=lambda read: read[1].xy,
         jobs=jobs,
         progress=progress,
     )
@@ -196,7 +193,7 @@ def each_photograph(
     photographs: PhotographList,
     work: Callable[[Path], T],
     *,
-    picture: Callable[[T], bytes] | None = None,
+    places: Callable[[T], FloatArray] | None = None,
     jobs: int = 1,
     progress: Progress = SILENT,
 ) -> tuple[dict[int, T], tuple[FailedImage, ...]]:
@@ -208,8 +205,8 @@ def each_photograph(
     Args:
         photographs: files of the photographs.
         work: function of a file; raises PhotographError with the reason if the file cannot be read.
-        picture: returns a key of the picture from the result, since a copy that was saved again has other
-            bytes; empty if nothing identifies it.
+        places: returns the image points of the result, px, (k, 2), by which a copy that was saved again, with
+            other bytes, is recognised unless they are few.
         jobs: number of photographs processed in parallel.
         progress: receives every photograph.
 
@@ -252,8 +249,8 @@ def each_photograph(
             raise
     pictures: dict[bytes, int] = {}
     for k in sorted(results):
-        shown = b"" if picture is None else picture(results[k])
-        first = pictures.setdefault(shown, k) if shown else k
+        xy = np.zeros((0, 2)) if places is None else places(results[k])
+        first = pictures.setdefault(xy.tobytes(), k) if len(xy) >= MIN_COMMON else k
         if first != k:
             original = photographs.names[first]
             failed[k] = FailedImage(
@@ -333,15 +330,14 @@ def separate_sizes(survey: Survey, files: PhotographList) -> OtherSizes:
         survey: states the cameras.
         files: photographs of the survey; those that cannot be read stay with their camera.
     """
-    sizes = [_size(path) for path in files.paths]
     cameras, owner = list(survey.cameras), files.camera.copy()
     left: dict[int, Remark] = {}
     remarks = []
     for number, camera in enumerate(survey.cameras):
         counted: dict[Size, list[int]] = {}
         for k in np.flatnonzero(files.camera == number).tolist():
-            if (size := sizes[k]) is not None:
-                counted.setdefault(size, []).append(k)
+            if (metadata := files.metadata_of(k)) is not None:
+                counted.setdefault(metadata.size_px, []).append(k)
         main = _main_size(camera, counted)
         if main is None:
             continue
@@ -391,13 +387,6 @@ def separate_sizes(survey: Survey, files: PhotographList) -> OtherSizes:
         tuple(FailedImage(files.names[k], why) for k, why in sorted(left.items())),
         tuple(remarks),
     )
-
-
-def _size(path: Path) -> Size | None:
-    try:
-        return read_metadata(path).size_px
-    except PhotographError:  # reported when it is measured
-        return None
 
 
 def _main_size(camera: CameraSettings, counted: dict[Size, list[int]]) -> Size | None:

@@ -29,7 +29,6 @@ from sfm.photographs.masks import Masks
 from sfm.photographs.reading import PhotographFiles, read_photograph
 from sfm.runtime.progress import SILENT, Progress, reported
 from sfm.survey.inputs.cameras import start_cameras
-from sfm.survey.inputs.checks.copies import MIN_COMMON
 from sfm.survey.inputs.measurements import Measurements, PhotographList
 from sfm.survey.inputs.settings import TiePointSettings
 from sfm.survey.inputs.start import network_of
@@ -90,7 +89,7 @@ def tie_photographs(
     detected, failed = each_photograph(
         files,
         read_and_detect,
-        picture=_picture,
+        places=lambda read: read[1].xy,
         jobs=jobs,
         progress=progress,
     )
@@ -221,12 +220,6 @@ def drawn_windows(network: Network, paths: Sequence[Path], window_px: int) -> tu
         none = np.zeros(0, dtype=np.int64)
         drawn.append(PhotographTargets(name, path, xy, radius, np.zeros(len(xy)), np.zeros((0, 2)), none))
     return tuple(drawn)
-
-
-def _picture(read: tuple[Metadata, NaturalPoints, bool]) -> bytes:
-    """Return the places of the features, by which a copy is recognised; nothing of few."""
-    natural = read[1]
-    return natural.xy.tobytes() if len(natural) >= MIN_COMMON else b""
 
 
 def natural_points_of(
