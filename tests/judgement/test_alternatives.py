@@ -248,6 +248,12 @@ def _by_photograph(D: FloatArray, image: IntArray, m: int) -> FloatArray:
     return by.reshape(len(D), 2, -1)
 
 
+def _spread_along(reduced: Any, direction: FloatArray, step: FloatArray, variance: float) -> Spread:
+    """Return the sum of squares of the scores of m photographs over m - 1 parts in m of their variance."""
+    m, scores = reduced.photographs, reduced.scores(direction, step)
+    return Spread((scores**2).sum() / (variance * (m - 1) / m), m - 1, among=False)
+
+
 def _assert_judged(one: Alternative, dense: Dense, spread: Spread) -> None:
     found = one.spread
     assert found.factor == pytest.approx(spread.factor, rel=1e-4)
@@ -386,7 +392,7 @@ def test_held_parameters_are_judged_by_what_photographs_say_of_them(dense: Dense
         direction = D @ one.gain.beta
         variance = float(one.gain.beta @ dense.normals(D)[0] @ one.gain.beta)
         spreads = [
-            alternatives._spread_along(dense.reduced, direction, step, variance)
+            _spread_along(dense.reduced, direction, step, variance)
             for step in (direction, whole @ owner.gain.beta)
         ]
         spread = min(spreads, key=lambda one: one.factor)
@@ -394,7 +400,7 @@ def test_held_parameters_are_judged_by_what_photographs_say_of_them(dense: Dense
     one = next(one for one in dense.every if one.family is families.FORMAT)
     D = dense.reduced.whiten(one.columns(dense.a, dense.columns))
     step, variance = D @ one.gain.beta, float(one.gain.beta @ dense.normals(D)[0] @ one.gain.beta)
-    spread = alternatives._spread_along(dense.reduced, step, step, variance)
+    spread = _spread_along(dense.reduced, step, step, variance)
     _assert_judged(one, dense, spread)
 
 

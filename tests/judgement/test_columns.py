@@ -25,11 +25,17 @@ def a() -> Adjustment:
     return adjust(network, truth, datum=Datum("free"), reject="none")
 
 
-def test_camera_columns_by_hand() -> None:
-    x, y, r2 = 0.5, -0.2, 0.29
-    across = [1, 0, x * r2, x * r2**2, r2 + 2 * x**2, 2 * x * y, x, y]
-    down = [0, 1, y * r2, y * r2**2, 2 * x * y, r2 + 2 * y**2, 0, 0]
-    np.testing.assert_allclose(columns._camera(np.array([[x, y]])), [[across, -np.array(down)]])
+def test_camera_columns_by_hand(a: Adjustment) -> None:
+    seen, estimate = a.network.image_points, a.estimate
+    by_camera = columns_of(a).freedoms[:, :, 1:9]
+    for k, (i, j) in enumerate(zip(seen.image, seen.point, strict=True)):
+        camera = estimate.cameras[a.network.camera[i]]
+        U, V, W = estimate.rotation[i].T @ (estimate.points[j] - estimate.position[i])
+        x, y = np.array([-U, -V]) / W * camera.c_px / (max(camera.size_px) / 2)
+        r2 = x * x + y * y
+        across = [1, 0, x * r2, x * r2**2, r2 + 2 * x**2, 2 * x * y, x, y]
+        down = [0, 1, y * r2, y * r2**2, 2 * x * y, r2 + 2 * y**2, 0, 0]
+        np.testing.assert_allclose(by_camera[k], [across, -np.array(down)], atol=1e-12)
 
 
 def test_fields_of_the_object_by_hand() -> None:

@@ -101,7 +101,12 @@ def test_the_shift_by_a_value_is_in_standard_deviations_of_what_all_give() -> No
     model = GivenModel(
         np.array([0.0, 0, 0, 2]), np.zeros((4, 4)), np.eye(4), np.ones((4, 1)), np.arange(4), 500
     )
-    assert given._shifts(model)[3] == pytest.approx(0.5 / np.sqrt(1 / 4))
+    judgement = SimpleNamespace(one_wrong=True, doubtful=(3,), statistic=3.0, dof=3)
+    placed = SimpleNamespace(strain=None, model=model, exchangeable=())
+    group: Any = SimpleNamespace(judgement=judgement, placed=placed, names=tuple("abcd"), of="control")
+    task: Any = SimpleNamespace(settings=SimpleNamespace(rescale=False))
+    shift = given._doubtful(task, group).number("shift")
+    assert shift == pytest.approx(0.5 / np.sqrt(1 / 4))
 
 
 def test_contradicting_lengths_differ_by_their_standard_deviation() -> None:

@@ -13,6 +13,7 @@ from scipy import stats
 from scipy.sparse import csr_matrix
 
 from sfm.adjustment.datum import Datum
+from sfm.adjustment.quality.statistics import non_centrality
 from sfm.judgement.given import judge as given
 from sfm.judgement.given import values as given_values
 from sfm.judgement.given.groups import GivenSettings, Group, contradiction_of, remarks_on_unchecked
@@ -346,13 +347,14 @@ def test_the_shift_by_doubtful_points_is_that_of_the_weights_that_they_get(resca
     task.settings = replace(task.settings, rescale=rescale)
     said = given._doubtful(task, group)
     model = group.placed.model
-    shift = given._shifts(model)[[1, 4]].max() / (model.factor()[0] if rescale else 1.0)
+    effects = np.sqrt(model.kept().decreases()[0]) * model.external() / non_centrality()
+    shift = effects[[1, 4]].max() / (model.factor()[0] if rescale else 1.0)
     assert said.kind == "given_contradicted" and said.names("given") == ("control 1", "control 4")
     assert said.number("shift") == pytest.approx(shift)
     fixed = replace(
         group, placed=replace(group.placed, points=group.placed.points.with_stated(np.zeros((6, 3, 3))))
     )
-    assert given._doubtful(task, fixed).number("shift") == pytest.approx(given._shifts(model)[[1, 4]].max())
+    assert given._doubtful(task, fixed).number("shift") == pytest.approx(effects[[1, 4]].max())
     _, several = judged_group("doubtful shift", doubtful=(1, 4))
     assert "shift" not in given._doubtful(task, several).numbers
 

@@ -33,7 +33,7 @@ from sfm.judgement.given.scales import judge_scales
 from sfm.judgement.given.tables import Table, as_judged, judge_tables
 from sfm.judgement.given.values import GivenModel
 from sfm.judgement.survey_result import GivenTest
-from sfm.model.conventions import BoolArray, FloatArray
+from sfm.model.conventions import BoolArray
 from sfm.model.network import ExteriorObservations, Network, ObjectPoints, ScaleBars
 from sfm.model.observations.kind import CoordinateKind
 from sfm.model.observations.point_pairs import Distances
@@ -339,7 +339,11 @@ def _doubtful(task: Task, group: Group) -> Remark:
         )
     shift = np.inf
     if judgement.one_wrong:
-        shift = float(_shifts(model)[list(judgement.doubtful)].max())
+        # the largest effect of one of them on the parameters, in their standard deviations
+        reach = model.external()
+        known = np.where(np.isfinite(reach), reach, 0.0)
+        effect = np.sqrt(model.kept().decreases()[0]) * known / non_centrality()
+        shift = float(np.where(np.isfinite(reach), effect, np.inf)[list(judgement.doubtful)].max())
         # they take part with standard deviations from their differences, if these may be replaced
         if task.settings.rescale and group.placed.points.stated.any() and model.at_worst.fits(task.level):
             shift /= model.factor()[0]
@@ -352,13 +356,6 @@ def _doubtful(task: Task, group: Group) -> Remark:
         dof=judgement.dof,
         shift=shift if np.isfinite(shift) else None,
     )
-
-
-def _shifts(model: GivenModel) -> FloatArray:
-    """Return the largest effect of each given value on the parameters, in their standard deviations."""
-    reach = model.external()
-    shift = np.sqrt(model.kept().decreases()[0]) * np.where(np.isfinite(reach), reach, 0.0) / non_centrality()
-    return np.where(np.isfinite(reach), shift, np.inf)
 
 
 def shift_of_fixed(model: GivenModel, sigma: float) -> float:

@@ -164,24 +164,20 @@ def _in_all(
     """Yield an alternative of whitened columns (k, 2, q) that all photographs share, if it has a gain.
 
     Photographs differ by what remains after its step, or after a `further` step (k, 2) if that leaves less.
+
+    Source: White (1982), Econometrica 50, for a score test with dependent observations.
     """
     H, g, squares = reduced.project(D)
     gain = gain_of(H, g, squares, least_share(len(H)))
     if gain.rank:
         step, variance = D @ gain.beta, float(gain.beta @ H @ gain.beta)
-        spreads = [
-            _spread_along(reduced, step, after, variance) for after in (step, further) if after is not None
-        ]
-        yield replace(alternative, gain=gain, spread=min(spreads, key=lambda spread: spread.factor))
-
-
-def _spread_along(reduced: Reduced, direction: FloatArray, step: FloatArray, variance: float) -> Spread:
-    """Return the spread of the scores of photographs in one direction over their expected variance.
-
-    Source: White (1982), Econometrica 50, for a score test with dependent observations.
-    """
-    m, scores = reduced.photographs, reduced.scores(direction, step)
-    return Spread(float(scores @ scores) / variance * m / (m - 1), m - 1, among=False) if m > 1 else NONE
+        m, spreads = reduced.photographs, list[Spread]()
+        for after in (step, further):
+            if after is not None and m > 1:  # scores of photographs along the step over their variance
+                scores = reduced.scores(step, after)
+                spreads.append(Spread(float(scores @ scores) / variance * m / (m - 1), m - 1, among=False))
+        least = min(spreads, key=lambda spread: spread.factor, default=NONE)
+        yield replace(alternative, gain=gain, spread=least)
 
 
 def _by_photographs(reduced: Reduced) -> Iterator[Alternative]:

@@ -80,24 +80,18 @@ def columns_of(a: Adjustment) -> Columns:
     exterior = np.concatenate([-point, by_axes @ skew(UVW)], axis=2)
     by_object = np.einsum("kac,kcf->kaf", point, object_fields(estimate.points)[0][seen.point])
     usable = np.isfinite(point).all(axis=(1, 2)) & (W < 0)
+    # the freedoms of a camera other than c, 1 px at the edge, by tangents over that of half the longer side
+    x, y = flat.T
+    r2, ones, zero = x**2 + y**2, np.ones(k), np.zeros(k)
+    across = [ones, zero, x * r2, x * r2**2, r2 + 2 * x**2, 2 * x * y, x, y]
+    down = [zero, ones, y * r2, y * r2**2, 2 * x * y, r2 + 2 * y**2, zero, zero]
+    by_camera = np.stack([np.stack(across, -1), -np.stack(down, -1)], axis=1)
     columns = Columns(
-        exterior, point, np.concatenate([by_c[:, :, None], _camera(flat), by_object], axis=2), usable
+        exterior, point, np.concatenate([by_c[:, :, None], by_camera, by_object], axis=2), usable
     )
     for part in (columns.exterior, columns.point, columns.freedoms):
         part[~usable] = 0.0
     return columns
-
-
-def _camera(flat: FloatArray) -> FloatArray:
-    """Return the effect of the freedoms of a camera other than c, 1 px at the edge, (k, 2, 8).
-
-    Tangents are divided by that of half the longer side, y up, (k, 2).
-    """
-    x, y = flat.T
-    r2, ones, zero = x**2 + y**2, np.ones(len(x)), np.zeros(len(x))
-    across = [ones, zero, x * r2, x * r2**2, r2 + 2 * x**2, 2 * x * y, x, y]
-    down = [zero, ones, y * r2, y * r2**2, 2 * x * y, r2 + 2 * y**2, zero, zero]
-    return np.stack([np.stack(across, -1), -np.stack(down, -1)], axis=1)
 
 
 def object_fields(points: FloatArray) -> tuple[FloatArray, float]:
