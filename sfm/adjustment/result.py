@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass, field, replace
-from functools import cached_property, wraps
+from functools import cached_property, partial, wraps
 from typing import Concatenate, NamedTuple, ParamSpec, TypeVar
 
 import numpy as np
@@ -159,9 +159,6 @@ class Adjustment:
         """Level, headline and all remarks; None if it was not judged."""
         return None if self.judge is None else self.judge(self)
 
-    def _judged(self) -> Verdict | None:
-        return self.verdict
-
     def __getstate__(self) -> dict[str, object]:
         """Return what is pickled: not the figures that are computed again when needed."""
         return {name: value for name, value in self.__dict__.items() if name != "_figures"}
@@ -185,7 +182,7 @@ class Adjustment:
             rig_covariance=self.covariance.rigs if len(self.covariance.rigs) else None,
             joint=None if self.joint is None else self.joint(self),
             sigma0=self.sigma0 if self.sigma0 > 0 else 1.0,
-            judged=self._judged,
+            judged=partial(getattr, self, "verdict"),
         )
 
     @property

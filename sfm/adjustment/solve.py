@@ -179,13 +179,10 @@ def adjust(
         result = _result(local, run, optimum, weight, Q, sigma_px, SLOPES.get(reject))
         if not optimum.converged or (covariance and not result.undetermined and _has_open_c(result)):
             result = _with_open_start(result, local, problem, state, weight)
+        if reject != "tau":  # without rejection the usual probability that a good coordinate is rejected
+            alpha = float(2 * normal_sf(TUKEY)) if reject == "tukey" else Levels(false_alarm).question
         return local.back(
-            replace(
-                result,
-                image_sigma_factor=factor,
-                test_alpha=_level_of(reject, alpha, Levels(false_alarm).question),
-                false_alarm=false_alarm,
-            )
+            replace(result, image_sigma_factor=factor, test_alpha=alpha, false_alarm=false_alarm)
         )
 
 
@@ -289,13 +286,6 @@ def _small_weight_remarks(layout: Unknowns, weight: FloatArray, network: Network
         return ()
     names = [network.images[i] for i in np.flatnonzero(loose)]
     return (remark("photograph_without_weight", photographs=names),)
-
-
-def _level_of(reject: str, alpha: float, usual: float) -> float:
-    """Return the probability that a good image coordinate is rejected; the usual one without rejection."""
-    if reject == "tukey":
-        return float(2 * normal_sf(TUKEY))
-    return alpha if reject == "tau" else usual
 
 
 def _result(

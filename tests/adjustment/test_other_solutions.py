@@ -64,7 +64,7 @@ def test_solutions_are_others_from_one_standard_deviation_on(
     a = adjust(network, truth, datum=Datum("free"), reject="none")
     other_place = searched._Candidate(a.estimate, a.vPv)
     monkeypatch.setattr(searched._Search, "candidates", lambda *_, **__: [other_place])
-    monkeypatch.setattr(searched, "_apart", lambda *_: sigmas)
+    monkeypatch.setattr(searched._Place, "distance", lambda *_: sigmas)
     assert bool(searched.other_solutions(a)) == other
 
 
@@ -74,7 +74,10 @@ def test_uncertain_points_place_a_solution_as_little_as_they_count() -> None:
     sigma[0] = 10.0
     other = points.copy()
     other[0] += 5.0
-    assert searched._apart(points, other, sigma) == pytest.approx(0.5 * np.sqrt(3 / 36), rel=0.01)
+    first, second = (SimpleNamespace(points=xyz) for xyz in (points, other))
+    of_result: Any = None
+    apart = searched._Place(of_result, sigma).distance(first, second)
+    assert apart == pytest.approx(0.5 * np.sqrt(3 / 36), rel=0.01)
 
 
 def camera_at(model: str, x: float, y: float, *, free: bool = True) -> Any:
@@ -145,7 +148,7 @@ def test_other_solutions_are_described_by_the_first_camera_whose_c_is_free() -> 
         a.estimate.cameras = cameras
         scaled = tuple(one.with_parameters(one.parameters * 1.5) for one in cameras)
         other: Any = SimpleNamespace(cameras=scaled, points=np.eye(3))
-        found = searched._Place(a).describe(other, 1.0)
+        found = searched._Place(a, np.ones(3)).describe(other, 1.0)
         assert (found.camera, found.c, found.unit) == (name, pytest.approx(30.0), "mm")
         assert found.c_moved == pytest.approx(5.0) and not found.reflected
 

@@ -17,7 +17,6 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 from dataclasses import dataclass, replace
-from functools import cached_property
 
 import numpy as np
 
@@ -88,7 +87,7 @@ def other_solutions(
     if base is None or base.redundancy < 1 or not base.vPv > 0:
         return ()
     limit = 1 + _allowed(base, a.levels.question) / base.vPv
-    result = _Place(a)
+    result = _Place(a, np.sqrt(np.trace(a.covariance.points, axis1=1, axis2=2) / 3))
     others: list[OtherSolution] = []
     tried = search.candidates(a.estimate, starts, base.vPv, limit, follow_c=bool(had_to_be_held))
     for candidate in sorted(tried, key=lambda candidate: candidate.vPv):
@@ -287,6 +286,7 @@ class _Place:
     """The result that other solutions are compared with, in its standard deviations."""
 
     adjustment: Adjustment
+    sigma: FloatArray  # standard deviation of a coordinate of each point, (n,)
 
     def describe(self, other: Estimate, vPv: float) -> OtherSolution:
         """Return the description of another solution by its differences from the result."""
@@ -308,23 +308,14 @@ class _Place:
         )
 
     def distance(self, first: Estimate, other: Estimate) -> float:
-        """Return the RMS difference of the points of two solutions, in standard deviations of the result."""
-        return _apart(first.points, other.points, self._sigma)
-
-    @cached_property
-    def _sigma(self) -> FloatArray:
-        variance: FloatArray = np.trace(self.adjustment.covariance.points, axis1=1, axis2=2) / 3
-        return np.sqrt(variance)
-
-
-def _apart(points: FloatArray, others: FloatArray, sigma: FloatArray) -> float:
-    """Return the RMS difference of two sets of points after a similarity, divided by their sigmas (n,)."""
-    known = np.isfinite(sigma) & (sigma > 0)
-    if known.sum() < 3:
-        return 0.0
-    try:
-        placed = fit_similarity(points[known], others[known], weights=1 / sigma[known] ** 2)
-    except GeometryError:
-        return np.inf
-    off = (placed.apply(points[known]) - others[known]) / sigma[known, None]
-    return float(np.sqrt((off**2).mean()))
+        """Return the RMS difference of the points of two solutions after a similarity, over their sigmas."""
+        known = np.isfinite(self.sigma) & (self.sigma > 0)
+        if known.sum() < 3:
+            return 0.0
+        points, others, sigma = first.points[known], other.points[known], self.sigma[known]
+        try:
+            placed = fit_similarity(points, others, weights=1 / sigma**2)
+        except GeometryError:
+            return np.inf
+        off = (placed.apply(points) - others) / sigma[:, None]
+        return float(np.sqrt((off**2).mean()))

@@ -181,17 +181,15 @@ def fronts_of(observations: Observations, graph: csr_matrix) -> Fronts:
         _place(observations, added, where, local)
         rows = (6 * in_front[:, None] + np.arange(6)).ravel()
         fronts.append(Front(in_front, len(group), tuple(children[g]), parent, into, added, rows))
-    return Fronts(tuple(fronts), _halves(order.parents), local)
-
-
-def _halves(parents: list[int]) -> tuple[int, int]:
-    """Return the ends of two ranges of fronts that do not depend on each other; later fronts need both."""
-    last = len(parents) - 1
-    tops = [g for g, parent in enumerate(parents) if parent == -1]
+    # ends of two ranges of fronts that do not depend on each other; later fronts need both
+    last = len(order.parents) - 1
+    tops = [g for g, parent in enumerate(order.parents) if parent == -1]
+    below = [g for g, parent in enumerate(order.parents) if parent == last]
     if len(tops) > 1:
-        return tops[len(tops) // 2 - 1] + 1, last + 1
-    below = [g for g, parent in enumerate(parents) if parent == last]
-    return (below[len(below) // 2 - 1] + 1 if len(below) > 1 else 0), last
+        halves = tops[len(tops) // 2 - 1] + 1, last + 1
+    else:
+        halves = (below[len(below) // 2 - 1] + 1 if len(below) > 1 else 0), last
+    return Fronts(tuple(fronts), halves, local)
 
 
 @kernel
