@@ -371,6 +371,19 @@ def plane_from_rays(camera: Camera, rays: FloatArray) -> FloatArray:
     return np.asarray(2.0 * directions[:, :2] / np.where(depth > 0, depth, np.nan)[:, None])
 
 
+def border_pixels(camera: Camera, per_side: int) -> FloatArray:
+    """Return pixels along the border of a photograph, the upper, lower, left and right side, (4 per_side, 2).
+
+    Args:
+        camera: the camera of the photograph.
+        per_side: number of pixels of each side, with both of its corners.
+    """
+    width, height = camera.size_px
+    along, zeros, ones = np.linspace(0.0, 1.0, per_side), np.zeros(per_side), np.ones(per_side)
+    sides = ((along, zeros), (along, ones), (zeros, along), (ones, along))
+    return np.vstack([np.column_stack(side) for side in sides]) * (width - 1, height - 1)
+
+
 def within_reach(camera: Camera, xy_px: FloatArray, seen_px: FloatArray) -> BoolArray:
     """Return which pixels have a ray that photographs of the camera may have.
 

@@ -28,6 +28,7 @@ from sfm.judgement.survey_result import ControlCheck, SurveyResult
 from sfm.model.camera import (
     Camera,
     angle_between,
+    border_pixels,
     outermost_reached,
     pixel_from_rays,
     rays_from_pixel,
@@ -77,11 +78,21 @@ def protocol_of(result: SurveyResult, given: Given) -> Protocol:
     residuals = list(_groups(a, "source", source, names, seen.point, a.network.points)) if names[1:] else []
     residuals += _groups(a, "photograph", seen.image, a.network.images, seen.point, a.network.points)
     residuals += _groups(a, "point", seen.point, a.network.points, seen.image, a.network.images)
+    control = list[ControlCoordinate]()
+    if given.control is not None:
+        points = a.network.control.point
+        xyz, posterior = a.estimate.points[points], standard_deviations(a.covariance.points[points])
+        prior, names = given.control.sigma, given.control.names
+        numbers = np.stack(
+            [given.control.given, prior, xyz, posterior, given.control.difference, given.control.w], axis=-1
+        )
+        for k, c in np.argwhere(np.isfinite(prior)):
+            control.append(ControlCoordinate("control", names[k], "XYZ"[c], *numbers[k, c].tolist()))
     return Protocol(
         residuals=tuple(residuals),
         limits=_limits(result),
         control=(
-            *_control(a, given),
+            *control,
             *_checked(a, result.control_check),
             *check_coordinates(result, placed=True),
         ),
@@ -133,19 +144,6 @@ def _limits(result: SurveyResult) -> str:
     return "none rejected"
 
 
-def _control(a: Adjustment, given: Given) -> list[ControlCoordinate]:
-    control = given.control
-    if control is None:
-        return []
-    points = a.network.control.point
-    xyz, posterior = a.estimate.points[points], standard_deviations(a.covariance.points[points])
-    numbers = np.stack([control.given, control.sigma, xyz, posterior, control.difference, control.w], axis=-1)
-    return [
-        ControlCoordinate("control", control.names[k], "XYZ"[c], *numbers[k, c].tolist())
-        for k, c in np.argwhere(np.isfinite(control.sigma))
-    ]
-
-
 def _checked(a: Adjustment, check: ControlCheck | None) -> list[ControlCoordinate]:
     """Return the control that took no part, compared with the points placed on it."""
     if check is None:
@@ -173,16 +171,8 @@ def _lens(camera: Camera, seen: FloatArray) -> Lens:
         seen: its image points, px, (k, 2); see `within_reach`.
     """
     width, height = camera.size_px
-    along = np.linspace(0.0, 1.0, EDGE_STEPS)
-    x, y = (width - 1) * along, (height - 1) * along
-    zero, ones = np.zeros(EDGE_STEPS), np.ones(EDGE_STEPS)
-    edge = np.concatenate(
-        [
-            np.stack(side, axis=1)
-            for side in ((x, zero), (x, ones * (height - 1)), (zero, y), (ones * (width - 1), y))
-        ]
-    )
     straight = camera.with_parameters(np.where(camera.parts[2], 0.0, camera.parameters))
+    edge = border_pixels(camera, EDGE_STEPS)
     edge = edge[within_reach(camera, edge, seen)]
     moved = np.linalg.norm(pixel_from_rays(straight, rays_from_pixel(camera, edge)) - edge, axis=1)
     middle = np.array([[0.0, (height - 1) / 2], [width - 1.0, (height - 1) / 2]])

@@ -22,7 +22,14 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from sfm.model.arguments import checked_arguments
-from sfm.model.camera import Camera, camera_from_values, project, ray_directions, tangents_from_pixel
+from sfm.model.camera import (
+    Camera,
+    border_pixels,
+    camera_from_values,
+    project,
+    ray_directions,
+    tangents_from_pixel,
+)
 from sfm.model.conventions import AnyArray, FloatArray, angles_from_rotation, rotation_from_angles
 from sfm.model.display import counted
 from sfm.model.distributions import MARGIN
@@ -354,7 +361,7 @@ def make_normal_images(network: Network, estimate: Estimate, first: str, second:
     c_px = float(np.mean([camera.c_px for camera in cameras]))
     centred = camera_from_values("centred", "brown", (1, 1), (1.0, 1.0), c_mm=c_px)
     seen = [
-        _project_rays(centred, R, camera, turned, _border(camera))
+        _project_rays(centred, R, camera, turned, border_pixels(camera, BORDER_POINTS))
         for camera, turned in zip(cameras, rotation, strict=True)
     ]
     if not all(np.isfinite(part).all() for part in seen):
@@ -382,19 +389,6 @@ def make_normal_images(network: Network, estimate: Estimate, first: str, second:
             )
         )
     return NormalImages(names, (normal[0], normal[1]), position, R, source)
-
-
-def _border(camera: Camera) -> FloatArray:
-    """Return points on the border of a photograph, px, (4 BORDER_POINTS, 2)."""
-    width, height = camera.size_px
-    along, zero = np.linspace(0, 1, BORDER_POINTS), np.zeros(BORDER_POINTS)
-    unit = np.vstack(
-        [
-            np.column_stack(pair)
-            for pair in ((along, zero), (along, zero + 1), (zero, along), (zero + 1, along))
-        ]
-    )
-    return unit * (width - 1, height - 1)
 
 
 def _project_rays(
