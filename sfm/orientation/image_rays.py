@@ -7,7 +7,7 @@ from collections.abc import Sequence
 import cv2
 import numpy as np
 
-from sfm.model.camera import Camera, rays_from_pixel, tangents_from_pixel
+from sfm.model.camera import Camera, project, rays_from_pixel, tangents_from_pixel
 from sfm.model.conventions import BoolArray, FloatArray, IntArray, skew
 from sfm.model.estimate import Estimate
 from sfm.model.network import ImagePoints, Network, rows_of
@@ -89,6 +89,22 @@ def axes_along(rays: FloatArray) -> FloatArray:
     length = np.linalg.norm(x, axis=1, keepdims=True)
     x = np.where(length > 0, x / np.where(length > 0, length, 1.0), (1.0, 0.0, 0.0))  # a ray along y
     return np.stack([x, np.cross(z, x), z], axis=2)
+
+
+def image_residuals(network: Network, estimate: Estimate) -> FloatArray:
+    """Return computed minus measured position of every image point, px, NaN where undetermined, (k, 2).
+
+    Args:
+        network: network of k image points.
+        estimate: estimate of this network.
+    """
+    seen = network.image_points
+    computed = np.full((len(seen), 2), np.nan)
+    for i, rows in enumerate(rows_of(seen.image, len(network.images))):
+        if len(rows) and estimate.oriented[i]:
+            camera, points = estimate.cameras[network.camera[i]], estimate.points[seen.point[rows]]
+            computed[rows] = project(camera, estimate.position[i], estimate.rotation[i], points)
+    return computed - seen.xy
 
 
 def ray_angles(network: Network, estimate: Estimate, used: BoolArray) -> FloatArray:

@@ -22,7 +22,7 @@ from sfm.model.estimate import Estimate
 from sfm.model.network import Network, empty_estimate, rows_of
 from sfm.model.reduced_network import reduce_network
 from sfm.model.remarks.remark import Remark, remark
-from sfm.orientation.image_rays import image_tangents
+from sfm.orientation.image_rays import image_residuals, image_tangents
 from sfm.orientation.incremental.starting_pair import Start, best_start
 from sfm.orientation.intersection import RayLimits, intersect
 from sfm.orientation.resection.ransac import RobustResection, fewest_fitting, resect_robust
@@ -390,17 +390,8 @@ def residual_lengths(network: Network, estimate: Estimate) -> FloatArray:
         network: network of k image points.
         estimate: estimate of this network.
     """
-    seen = network.image_points
-    out = np.full(len(seen), np.inf)
-    order = np.argsort(seen.image, kind="stable")
-    bounds = np.searchsorted(seen.image[order], np.arange(len(network.images) + 1))
-    for i in np.flatnonzero(estimate.oriented):
-        rows = order[bounds[i] : bounds[i + 1]]
-        camera = estimate.cameras[network.camera[i]]
-        xy = project(camera, estimate.position[i], estimate.rotation[i], estimate.points[seen.point[rows]])
-        length = np.linalg.norm(xy - seen.xy[rows], axis=1)
-        out[rows] = np.where(np.isfinite(length), length, np.inf)
-    return out
+    length = np.linalg.norm(image_residuals(network, estimate), axis=1)
+    return np.where(np.isfinite(length), length, np.inf)
 
 
 def _free_by_stages(camera: Camera, network: Network, index: int) -> Camera:

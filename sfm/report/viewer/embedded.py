@@ -26,11 +26,10 @@ from markupsafe import Markup
 
 from sfm.files.plain_text import or_none
 from sfm.judgement.survey_result import sort_likeliest_first
-from sfm.model.camera import project
 from sfm.model.conventions import AnyArray, BoolArray, FloatArray, IntArray, angles_from_rotation
-from sfm.model.network import ImagePoints, ScaleBars
+from sfm.model.network import ScaleBars
 from sfm.model.solution import MAX_POINTS, SeenTargets, Solution
-from sfm.orientation.image_rays import ray_angles
+from sfm.orientation.image_rays import image_residuals, ray_angles
 from sfm.report.figures.overlays import nearest_image_points
 from sfm.report.findings import Findings
 from sfm.report.network_geometry import rms_of_groups
@@ -243,7 +242,7 @@ def scene_of_stored(
     w = np.full((len(seen), 2), np.nan) if w is None else w
     kept = np.flatnonzero(estimate.oriented[seen.image] & estimate.determined[seen.point])
     kept = kept[np.lexsort((seen.image[kept], seen.point[kept]))]
-    v = (_residuals(stored, seen) if residuals is None else residuals)[kept]
+    v = (image_residuals(network, estimate) if residuals is None else residuals)[kept]
     point = np.searchsorted(determined, seen.point[kept])
     photo = np.searchsorted(oriented, seen.image[kept])
     used = ~rejected[kept]
@@ -318,20 +317,6 @@ def _bars(bars: ScaleBars, xyz: FloatArray, index: dict[int, int]) -> tuple[Bar,
                 Bar(start, end, length, sigma, float(np.linalg.norm(xyz[start] - xyz[end])) - length)
             )
     return tuple(shown)
-
-
-def _residuals(stored: Solution, seen: ImagePoints) -> FloatArray:
-    """Return computed minus measured position of every image point, px; NaN if not known, (k, 2)."""
-    network, estimate = stored.network, stored.estimate
-    computed = np.full(seen.xy.shape, np.nan)
-    order = np.argsort(seen.image, kind="stable")
-    ends = np.searchsorted(seen.image[order], np.arange(1, len(network.images)))
-    for i, rows in enumerate(np.split(order, ends)):
-        if len(rows) and estimate.oriented[i]:
-            camera = estimate.cameras[network.camera[i]]
-            where = estimate.position[i], estimate.rotation[i], estimate.points[seen.point[rows]]
-            computed[rows] = project(camera, *where)
-    return computed - seen.xy
 
 
 def joined_targets(seen: SeenTargets, image: IntArray, xy: FloatArray) -> tuple[FloatArray, Marks]:
