@@ -238,8 +238,14 @@ def _targets_of(
     counter = find_counters(grey, fit.xy[free], fit.shape[free], dots.levels[free])
     reason[free[counter]] = Flag.THIN_BACKGROUND.value
     xy, covariance = fit.xy, fit.covariance
+    if centres == "edges":
+        edges = measure_edge_ellipses(grey, fit.xy, fit.shape, outlines.sign, noise=noise)
+        xy, covariance = edges.xy, edges.covariance
+    elif centres != "model":
+        xy, covariance = measure_centroids(
+            grey, fit.xy, fit.shape, outlines.sign, noise=noise, weights=centres
+        )
     if centres != "model":
-        xy, covariance = _measure_centres(grey, fit, outlines.sign, noise, centres)
         reason[(reason == 0) & np.isnan(xy[:, 0])] = Flag.NO_CONVERGENCE.value
     covariance = covariance + off_centre[:, :, None] * off_centre[:, None, :]
     keep = np.flatnonzero(reason == 0)
@@ -265,16 +271,6 @@ def _targets_of(
         rejected_flag=np.concatenate([outlines.rejected_flag, reason[reason != 0]]),
     )
     return with_tags(targets)
-
-
-def _measure_centres(
-    grey: AnyArray, fit: EllipseFit, sign: IntArray, noise: float, centres: str
-) -> tuple[FloatArray, FloatArray]:
-    """Return centres, px, (k, 2), and covariances, (k, 2, 2), measured by another method at a fit."""
-    if centres == "edges":
-        edges = measure_edge_ellipses(grey, fit.xy, fit.shape, sign, noise=noise)
-        return edges.xy, edges.covariance
-    return measure_centroids(grey, fit.xy, fit.shape, sign, noise=noise, weights=centres)
 
 
 @dataclass(frozen=True)

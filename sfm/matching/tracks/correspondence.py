@@ -28,7 +28,7 @@ from sfm.matching.tracks.evidence import (
     same_target,
 )
 from sfm.model.arguments import check_indices, checked_arguments, checked_fields
-from sfm.model.camera import Camera, tangents_from_pixel
+from sfm.model.camera import tangents_from_pixel
 from sfm.model.conventions import BoolArray, FloatArray, IntArray
 from sfm.model.display import counted
 from sfm.model.errors import GeometryError
@@ -265,7 +265,13 @@ def _scene(
     uv, kind, size = np.zeros((total, 2)), np.zeros(total, dtype=np.int64), np.zeros(total)
     unusable = np.ones(total, dtype=bool)
     c = np.array([estimate.cameras[k].c_px for k in camera])
-    windows = [_window(lens) for lens in estimate.cameras]
+    windows = []  # largest upright window of tangents (u0, v0, u1, v1) inside the photograph of each camera
+    for lens in estimate.cameras:
+        width, height = lens.size_px
+        x, y = (np.linspace(0, side - 1, 21) for side in (width, height))
+        left, right = (tangents_from_pixel(lens, np.column_stack([0 * y + at, y])) for at in (0, width - 1))
+        top, bottom = (tangents_from_pixel(lens, np.column_stack([x, 0 * x + at])) for at in (0, height - 1))
+        windows.append([left[:, 0].max(), bottom[:, 1].max(), right[:, 0].min(), top[:, 1].min()])
     area, corner, cell = np.ones(m), np.zeros((m, 2)), np.ones(m)
     columns, cells = np.ones((m, 2), dtype=np.int64), np.zeros(m + 1, dtype=np.int64)
     cell_of = np.zeros(total, dtype=np.int64)
@@ -296,12 +302,3 @@ def _scene(
         cell, columns, cells[:-1], start, np.argsort(cell_of, kind="stable"),
     )  # fmt: skip
     return scene, unusable
-
-
-def _window(camera: Camera) -> FloatArray:
-    """Return the largest upright window of tangents (u0, v0, u1, v1) that lies inside the photograph."""
-    width, height = camera.size_px
-    x, y = (np.linspace(0, side - 1, 21) for side in (width, height))
-    left, right = (tangents_from_pixel(camera, np.column_stack([0 * y + at, y])) for at in (0, width - 1))
-    top, bottom = (tangents_from_pixel(camera, np.column_stack([x, 0 * x + at])) for at in (0, height - 1))
-    return np.array([left[:, 0].max(), bottom[:, 1].max(), right[:, 0].min(), top[:, 1].min()])

@@ -157,26 +157,15 @@ def _detect(
         if hidden is not None:
             at = shrink * (np.array([p.pt for p in points]).reshape(-1, 2) + 0.5) - 0.5
             points = [points[k] for k in np.flatnonzero(is_shown(hidden, at)).tolist()]
-        if shrink == 1:
-            response = np.array([p.response for p in points], dtype=np.float32)
-            points = [points[k] for k in _least_contrast(response, enough, least).tolist()]
+        if shrink == 1:  # those of the largest contrast, halved as often as needed, that leaves enough
+            response = np.array([p.response for p in points], dtype=np.float32)  # in a layer of the octave
+            of_octave, smallest = (response * np.float32(LAYERS)).astype(float), MIN_CONTRAST
+            while smallest > least and np.count_nonzero(of_octave >= smallest) < enough:
+                smallest = max(smallest / 2, least)
+            points = [points[k] for k in np.flatnonzero(of_octave >= smallest).tolist()]
         if len(points) >= enough or shrink == 1:
             return sift, picture, shrink, points
         shrink //= 2
-
-
-def _least_contrast(response: AnyArray, most: int, least: float) -> IntArray:
-    """Return the features of the largest contrast, MIN_CONTRAST halved as often as needed, that has enough.
-
-    Args:
-        response: contrast of each feature in a layer of the octave, over the full scale, float32, (k,).
-        most: number of features that is enough.
-        least: smallest contrast.
-    """
-    contrast, of_octave = MIN_CONTRAST, (response * np.float32(LAYERS)).astype(float)
-    while contrast > least and np.count_nonzero(of_octave >= contrast) < most:
-        contrast = max(contrast / 2, least)
-    return np.flatnonzero(of_octave >= contrast)
 
 
 def _strongest_per_cell(xy: FloatArray, strength: FloatArray, shape: tuple[int, ...], most: int) -> IntArray:

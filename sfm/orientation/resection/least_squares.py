@@ -348,21 +348,20 @@ def choose_by_line(
             f"line fitting: {counted(len(tangents), 'image point')}, needed those that the solutions have "
             "residuals of"
         )
-    lines = tuple(_fit(tangents.ravel(), (tangents + solution.residuals).ravel()) for solution in solutions)
+    lines = []
+    for solution in solutions:
+        measured, computed = tangents.ravel(), (tangents + solution.residuals).ravel()
+        if not np.isfinite(computed).all():  # a point is behind the camera
+            lines.append(LineFit(np.nan, np.nan, np.inf, np.inf))
+            continue
+        slope, intercept = np.polyfit(measured, computed, 1)
+        scatter = np.sqrt(np.mean((computed - slope * measured - intercept) ** 2))
+        departure = np.sqrt(np.mean((computed - measured) ** 2))
+        lines.append(LineFit(float(slope), float(intercept), float(scatter), float(departure)))
     departures = [line.departure for line in lines]
     if not np.isfinite(departures).any():
         raise GeometryError("line fitting: points lie behind the camera in every solution")
-    return solutions[int(np.argmin(departures))], lines
-
-
-def _fit(measured: FloatArray, computed: FloatArray) -> LineFit:
-    """Return the regression of computed on measured coordinates; infinite if a point is behind the camera."""
-    if not np.isfinite(computed).all():
-        return LineFit(np.nan, np.nan, np.inf, np.inf)
-    slope, intercept = np.polyfit(measured, computed, 1)
-    scatter = np.sqrt(np.mean((computed - slope * measured - intercept) ** 2))
-    departure = np.sqrt(np.mean((computed - measured) ** 2))
-    return LineFit(float(slope), float(intercept), float(scatter), float(departure))
+    return solutions[int(np.argmin(departures))], tuple(lines)
 
 
 @checked_arguments(position="3", rotation="3 3", points="n 3")
