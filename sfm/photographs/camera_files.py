@@ -64,11 +64,16 @@ def missing_library(path: Path) -> str:
     """
     ending = path.suffix.lower()
     name, module = ("pillow-heif", "pillow_heif") if ending in HEIF else ("rawpy", "rawpy")
-    return name if ending in (*HEIF, *RAW) and not _is_installed(module) else ""
+    return name if ending in (*HEIF, *RAW) and not is_installed(module) else ""
 
 
 @cache
-def _is_installed(module: str) -> bool:
+def is_installed(module: str) -> bool:
+    """Return whether a library of the extra kolinear[photographs] is installed.
+
+    Args:
+        module: the module that the library is imported by.
+    """
     return find_spec(module) is not None
 
 

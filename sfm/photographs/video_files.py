@@ -10,8 +10,6 @@ import os
 from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass, field
-from functools import cache
-from importlib.util import find_spec
 from pathlib import Path
 from typing import Any
 
@@ -19,6 +17,7 @@ import numpy as np
 
 from sfm.model.conventions import AnyArray, FloatArray
 from sfm.model.errors import PhotographError
+from sfm.photographs.camera_files import is_installed
 
 VIDEO = (".3gp", ".avi", ".insv", ".lrv", ".m2ts", ".m4v", ".mkv", ".mov", ".mp4", ".mpeg", ".mpg", ".mts",
          ".mxf", ".ogv", ".webm", ".wmv")  # fmt: skip
@@ -160,12 +159,7 @@ class Video:
 
 def missing_av() -> bool:
     """Return whether the library that reads videos is not installed."""
-    return not _is_installed()
-
-
-@cache
-def _is_installed() -> bool:
-    return find_spec("av") is not None
+    return not is_installed("av")
 
 
 def is_video(path: Path) -> bool:

@@ -200,7 +200,7 @@ def test_without_the_extra_one_line_names_it(
 ) -> None:
     (tmp_path / "a.HEIC").write_bytes(b"")
     (tmp_path / "b.nef").write_bytes(b"")
-    monkeypatch.setattr(camera_files, "_is_installed", lambda _: False)
+    monkeypatch.setattr(camera_files, "is_installed", lambda _: False)
     for name, library in (("a.HEIC", "pillow-heif"), ("b.nef", "rawpy")):
         with pytest.raises(PhotographError, match=rf"{name}: .*{library}.*kolinear\[photographs\]"):
             read_photograph(tmp_path / name)

@@ -118,7 +118,7 @@ def test_what_cannot_be_read_is_reported_with_the_remedy(
     name: str, told: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """Raw files are TIFF files whose first picture is a small preview."""
-    monkeypatch.setattr(camera_files, "_is_installed", lambda _: False)
+    monkeypatch.setattr(camera_files, "is_installed", lambda _: False)
     cv2.imwrite(str(tmp_path / "a.tif"), np.full((30, 40), 90, dtype=np.uint8))
     (tmp_path / "a.tif").rename(tmp_path / name)
     with pytest.raises(PhotographError, match=told):

@@ -263,7 +263,7 @@ def test_without_the_extra_one_line_names_it(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
     (tmp_path / "a.MP4").write_bytes(b"")
-    monkeypatch.setattr(video_files, "_is_installed", lambda: False)
+    monkeypatch.setattr(video_files, "is_installed", lambda _: False)
     for words in (("run", tmp_path / "a.MP4"), ("init", tmp_path / "a.MP4"), ("run", tmp_path)):
         assert "kolinear[photographs]" in refused(capsys, *words)
 
