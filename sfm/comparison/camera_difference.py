@@ -189,7 +189,10 @@ def compare_cameras(
     C, p_value = np.full((len(grid), 2, 2), np.nan), float("nan")
     sigmas = []
     if covariance[0] is not None:  # a pixel of a keeps its place, so that its ray moves the other way
-        sigmas.append(-_by_pixel(a, b, grid, R, t) @ _moved_by_sigma(a, rays, covariance[0]))
+        pairs = [(_points(a, grid + off), _points(a, grid - off)) for off in np.eye(2)]  # over two pixels
+        rays_by_pixel = np.stack([(after - before) / 2 for after, before in pairs], axis=-1)
+        by_pixel = ray_jacobian(b, pixel_from_rays(b, points), points) @ R @ rays_by_pixel
+        sigmas.append(-by_pixel @ _moved_by_sigma(a, rays, covariance[0]))
     if covariance[1] is not None:
         sigmas.append(_moved_by_sigma(b, points, covariance[1]))
     if any(columns.shape[2] for columns in sigmas):
@@ -269,16 +272,6 @@ def _lever(b: Camera, points: FloatArray, shifts: int) -> FloatArray:
     by_point[known] = ray_jacobian(b, pixels[known], points[known])
     columns = [by_point @ -skew(points)] + ([by_point] if shifts else [])  # w x point
     return np.concatenate(columns, axis=2)
-
-
-def _by_pixel(a: Camera, b: Camera, xy: FloatArray, R: FloatArray, t: FloatArray) -> FloatArray:
-    """Return the derivatives of pixels of b by the pixels of a that show the same points, (k, 2, 2).
-
-    The rays of a have differences over two pixels.
-    """
-    by_pixel = np.stack([(_points(a, xy + step) - _points(a, xy - step)) / 2 for step in np.eye(2)], axis=-1)
-    points = _points(a, xy) @ R.T + t
-    return np.asarray(ray_jacobian(b, pixel_from_rays(b, points), points) @ R @ by_pixel)
 
 
 def _moved_by_sigma(camera: Camera, rays: FloatArray, Q: FloatArray) -> FloatArray:

@@ -212,12 +212,22 @@ def worked(report: Report) -> Section:
     )
     fixes = agreeing(counts.constraints, "fixes|fix")
     besides = f"In addition, {counted(counts.constraints, 'constraint')} {fixes} the datum."
+    calibrated: tuple[Part, ...] = ()
+    if f.calibrated:  # the cameras are the result of the survey
+        of_cameras = []
+        for camera in f.calibrated:
+            values, sigmas, within, projection = describe_calibration(camera)
+            of_cameras.append((camera.name, f"{values}; 1 sigma {sigmas}; 95 % {within}"))
+            of_cameras.append(("projection", projection))
+            if view := describe_view(f, camera.name):
+                of_cameras.append((f"view of {camera.name}", view))
+        calibrated = (Heading("Calibrated cameras"), facts(of_cameras))
     lost: tuple[Part, ...] = ()
     if failed:
         lost = (Heading("Photographs not in the result"), left_out("photograph", f))
     return Section(
         "Did it work?",
-        *_calibrated(f),
+        *calibrated,
         state,
         Heading("Observations"),
         observed,
@@ -235,18 +245,6 @@ def left_out(kind: str, f: Findings) -> Table:
     if kind == "point":
         shown["image_points"] = Column("image points", format=str)
     return Table(columns_of(LEFT_OUT, shown), rows, most=MAX_LISTED, all_in=LEFT_OUT.file)
-
-
-def _calibrated(f: Findings) -> Iterator[Part]:
-    """Yield the calibrated cameras if they are the result of the survey."""
-    if f.calibrated:
-        rows = []
-        for camera in f.calibrated:
-            values, sigmas, within, projection = describe_calibration(camera)
-            rows += [(camera.name, f"{values}; 1 sigma {sigmas}; 95 % {within}"), ("projection", projection)]
-            rows += [(f"view of {camera.name}", view)] if (view := describe_view(f, camera.name)) else []
-        yield Heading("Calibrated cameras")
-        yield facts(rows)
 
 
 def quality(report: Report) -> Section:

@@ -88,12 +88,15 @@ def judge(remarks: Iterable[Remark], headlines: Mapping[Level, str]) -> Verdict:
     given = tuple(remarks)
     tests = tuple(remark for remark in given if remark.test is not None)
     every = tuple(remark for remark in given if remark.test is None)
-    every = tuple(
-        replace(remark, at_least=_worst_explained(remark, every))
-        for remark in every
-        if not any(_explains(cause, remark) for cause in every)
-    )
-    order = tuple(remark for severity in SEVERITIES for remark in every if remark.severity == severity)
+    causes = []
+    for remark in every:
+        if any(_explains(cause, remark) for cause in every):
+            continue
+        graded = not isinstance(remark.row.severity, str)
+        explained = [effect.severity for effect in every if graded and _explains(remark, effect)]
+        worst = min((remark.at_least, *explained), key=SEVERITIES.index)
+        causes.append(replace(remark, at_least=worst))
+    order = tuple(remark for severity in SEVERITIES for remark in causes if remark.severity == severity)
     level: Level = EFFECT[order[0].severity] if order else "good"
     return Verdict(level, headlines[level], order, tests)
 
@@ -103,13 +106,6 @@ def _explains(cause: Remark, remark: Remark) -> bool:
     graded = not isinstance(cause.row.severity, str)
     serious = cause.severity != "note" or remark.severity == "note"
     return remark.kind in cause.row.explains and (serious or not graded)
-
-
-def _worst_explained(cause: Remark, every: tuple[Remark, ...]) -> Severity:
-    """Return the worst severity of the remarks that a remark with a grade explains."""
-    graded = not isinstance(cause.row.severity, str)
-    explained = [effect.severity for effect in every if graded and _explains(cause, effect)]
-    return min((cause.at_least, *explained), key=SEVERITIES.index)
 
 
 def split_lines(lines: Sequence[Line]) -> tuple[tuple[Line, ...], tuple[Line, ...]]:

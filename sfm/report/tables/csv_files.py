@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterable, Sequence
+from itertools import combinations
 from pathlib import Path
 from typing import Any
 
@@ -54,8 +55,23 @@ def write_tables(findings: Findings, folder: Path, colours: AnyArray | None = No
     tables.VARIANCE_COMPONENTS.write_rows(folder, component_rows(statistics))
     tables.RESIDUALS.write_rows(folder, findings.protocol.residuals)
     tables.CONTROL_POINTS.write_rows(folder, findings.protocol.control)
-    tables.INTERIOR_CORRELATIONS.write_rows(folder, _correlation_rows(a))
-    tables.EXTERIOR_CORRELATIONS.write_rows(folder, _exterior_correlation_rows(findings))
+    interior = list[Sequence[object]]()  # all correlations of the interior parameters of each camera
+    for camera, Q in zip(a.estimate.cameras, a.covariance.interior, strict=True):
+        free = [camera.names[s] for s in np.flatnonzero(camera.free)[: len(Q)]]
+        sigma = np.sqrt(np.clip(np.diagonal(Q), 0, None))
+        for i, j in combinations(range(len(free)), 2):
+            known = sigma[i] * sigma[j]
+            interior.append((camera.name, free[i], free[j], Q[i, j] / known if known > 0 else np.nan))
+    tables.INTERIOR_CORRELATIONS.write_rows(folder, interior)
+    correlations = result.exterior_correlations
+    exterior: Iterable[Sequence[object]] = ()
+    if correlations is not None:  # of interior parameters with the exterior orientation of each photograph
+        exterior = (
+            (owner.removeprefix("camera "), parameter, image, *rho)
+            for c, (parameter, owner) in enumerate(correlations.parameters)
+            for image, rho in zip(correlations.images, correlations.rho[:, :, c], strict=True)
+        )
+    tables.EXTERIOR_CORRELATIONS.write_rows(folder, exterior)
     for table, names, covariance in (
         (tables.POINT_COVARIANCES, a.network.points, a.covariance.points),
         (tables.IMAGE_COVARIANCES, a.network.images, a.covariance.exterior),
@@ -184,24 +200,3 @@ def component_rows(statistics: Statistics) -> Iterable[Sequence[Any]]:
     ):
         for g, name in enumerate(components.names):
             yield (kind, name, int(components.count[g]), components.redundancy[g], components.sigma0[g])
-
-
-def _correlation_rows(a: Adjustment) -> Iterable[Sequence[object]]:
-    """Yield all correlations of the interior parameters of each camera."""
-    for camera, Q in zip(a.estimate.cameras, a.covariance.interior, strict=True):
-        names = [camera.names[s] for s in np.flatnonzero(camera.free)[: len(Q)]]
-        sigma = np.sqrt(np.clip(np.diagonal(Q), 0, None))
-        for r, first in enumerate(names):
-            for c in range(r + 1, len(names)):
-                known = sigma[r] * sigma[c]
-                yield camera.name, first, names[c], Q[r, c] / known if known > 0 else np.nan
-
-
-def _exterior_correlation_rows(findings: Findings) -> Iterable[Sequence[object]]:
-    """Yield the correlations of every interior parameter with every photograph's exterior orientation."""
-    correlations = findings.result.exterior_correlations
-    if correlations is None:
-        return
-    for c, (parameter, camera) in enumerate(correlations.parameters):
-        for image, rho in zip(correlations.images, correlations.rho[:, :, c], strict=True):
-            yield (camera.removeprefix("camera "), parameter, image, *rho)

@@ -14,9 +14,8 @@ import numpy as np
 
 from sfm.adjustment.quality.statistics import CoordinateTest
 from sfm.adjustment.quality.variance_components import VarianceComponents
-from sfm.adjustment.result import Adjustment
 from sfm.files.plain_text import or_none
-from sfm.judgement.bundle_statistics import Given, Spread, summarise_redundancy
+from sfm.judgement.bundle_statistics import Spread, summarise_redundancy
 from sfm.judgement.survey_result import SurveyResult
 from sfm.model.conventions import FloatArray
 from sfm.model.observation_residuals import CENTRE, ROTATION, GivenResiduals
@@ -55,7 +54,11 @@ def _finite(value: Any, name: str, names: list[str]) -> Any:
 def _figures(findings: Findings) -> dict[str, Any]:
     """Return the figures of a result, some of which may not be finite."""
     result, given = findings.result, findings.given
-    a = result.adjustment
+    a, correlation = result.adjustment, result.adjustment.error_correlation
+    bars, names = a.network.scale_bars, a.network.points
+    further = defaultdict[str, list[dict[str, Any]]](list)  # with all groups of a kind together
+    for kind in given.further:
+        further[kind.kind] += _given_values(kind, "name", "component")
     coded = int((result.code >= 0).sum())
     return {
         **values_of(result, "survey unit length_unit"),
@@ -94,7 +97,9 @@ def _figures(findings: Findings) -> dict[str, Any]:
             **values_of(a, "defect expected_defect undetermined"),
         },
         **values_of(a, "sigma0 sigma0_px"),
-        "error_correlation": _error_correlation(a),
+        "error_correlation": correlation  # None if all errors are independent
+        and dict(zip(("alone_px", "common_px"), correlation.sigmas_px(a.sigma0_px), strict=True))
+        | values_of(correlation, "length_px design_effect"),
         **values_of(a, "rms_px max_residual_px"),
         "cameras": [
             values_of(camera, "name model size_px pixel_mm")
@@ -113,7 +118,12 @@ def _figures(findings: Findings) -> dict[str, Any]:
         "consistency": _consistency(findings),
         "geometry": _geometry(findings),
         "control": _control(findings),
-        "scale_bars": _scale_bars(findings),
+        "scale_bars": [
+            {"from": names[i], "to": names[j]}
+            | values_of(bar, "difference sigma r w")
+            | {"length": plain(bar.given)}
+            for i, j, bar in zip(bars.start, bars.end, given.bars.values if given.bars else (), strict=True)
+        ],
         "equipment": [
             values_of(equipment, "name given_as")
             | {"calibrated": equipment.calibrated.isoformat()}
@@ -129,7 +139,7 @@ def _figures(findings: Findings) -> dict[str, Any]:
             for kind in (CENTRE, ROTATION)
             for value in _given_values(given.of(kind), "image", "parameter")
         ],
-        "further_observations": _further(given),
+        "further_observations": dict(further),
         "group_parameters": [
             {
                 "group": parameters.group,
@@ -145,20 +155,6 @@ def _figures(findings: Findings) -> dict[str, Any]:
         "comparison": _comparison(result),
         "baseline": _baseline(result),
         "seconds": {time.stage: round(time.seconds, 3) for time in result.seconds},
-    }
-
-
-def _error_correlation(a: Adjustment) -> dict[str, float] | None:
-    """Return independent and shared error of neighbouring image points, px; None if all are independent."""
-    if a.error_correlation is None:
-        return None
-    alone, common = a.error_correlation.sigmas_px(a.sigma0_px)
-    correlation = a.error_correlation
-    return {
-        "alone_px": alone,
-        "common_px": common,
-        "length_px": correlation.length_px,
-        "design_effect": correlation.design_effect,
     }
 
 
@@ -306,17 +302,6 @@ def _control(findings: Findings) -> dict[str, Any] | None:
     }
 
 
-def _scale_bars(findings: Findings) -> list[dict[str, Any]]:
-    network = findings.result.adjustment.network
-    bars, names = network.scale_bars, network.points
-    ends = [{"from": names[i], "to": names[j]} for i, j in zip(bars.start, bars.end, strict=True)]
-    values = _given_values(findings.given.bars)
-    for bar in values:
-        bar["length"] = bar.pop("given")
-        del bar["unit"]
-    return [end | bar for end, bar in zip(ends, values, strict=True)]
-
-
 def _given_values(residuals: GivenResiduals | None, *keys: str) -> list[dict[str, Any]]:
     """Return every given value of a kind; `keys` are the keys of its name and coordinate."""
     return [
@@ -379,14 +364,6 @@ def _baseline(result: SurveyResult) -> dict[str, Any] | None:
         "targets": baseline.targets,
         **values_of(baseline, "target_rms_px point_rms max_point position_rms max_rotation_deg"),
     }
-
-
-def _further(given: Given) -> dict[str, list[dict[str, Any]]]:
-    """Return the values of all further kinds, with all groups of a kind together."""
-    values = defaultdict[str, list[dict[str, Any]]](list)
-    for kind in given.further:
-        values[kind.kind] += _given_values(kind, "name", "component")
-    return dict(values)
 
 
 def summary_of_rigs(rigs: Sequence[Rig]) -> list[dict[str, Any]]:
