@@ -58,7 +58,6 @@ MOMENTS = {
 FREE_OF_TEXTURE = ("c", "x0", "y0", "K1", "K2")
 FREE_BY_TARGETS = ("c", "x0", "y0", "K1", "K2", "K3", "P1", "P2", "b1", "b2")
 FREE_OF_FISHEYES = ("fx", "fy", "cx", "cy", "k1", "k2", "k3", "k4")
-FREE_BY_PLATES = ("c", "x0", "y0", "K1", "K2", "P1", "P2", "b1")
 SIGMA_PX, CORNER_SIGMA_PX = 0.05, 0.1  # of circles; and of corners, crossings and natural points
 OUTSIDE = "not used outside the folder: move the masks, or uncomment the line for --allow-outside"
 PITCH = 25.0  # assumed pitch of a plate, UNIT: that of many printed boards
@@ -158,10 +157,8 @@ class _Content:
 
     @property
     def free(self) -> tuple[str, ...]:
-        """Free parameters of the cameras; empty for texture, where the adjustment chooses them."""
-        if self.trial.plate is not None:
-            return FREE_BY_PLATES
-        return FREE_BY_TARGETS if self.trial.codes != "none" else ()
+        """Free parameters of the cameras; empty for texture and plates, where the adjustment chooses them."""
+        return FREE_BY_TARGETS if self.trial.codes != "none" and self.trial.plate is None else ()
 
 
 def names_of_folder(folder: Path) -> Iterator[str]:
@@ -382,7 +379,7 @@ def _what_pairs(rig: ProposedRig) -> str:
 
 
 def _model_lines(camera: CameraGroup, free: Sequence[str]) -> list[str]:
-    """Return the lines of model and free parameters; as comments for texture, where they are chosen."""
+    """Return the lines of model and free parameters; as comments where they are chosen."""
     lines = (
         ['model = "brown"'] if free else ['# model = "brown"  # without it: what the photographs determine']
     )
