@@ -5,6 +5,7 @@ from __future__ import annotations
 from dataclasses import replace
 from pathlib import Path
 
+import cv2
 import numpy as np
 import pytest
 
@@ -18,6 +19,8 @@ from sfm.model.camera import camera_from_values
 from sfm.model.estimate import Estimate
 from sfm.model.network import ObjectPoints
 from sfm.model.remarks.remark import Remark, kinds_of, of_kind
+from sfm.products.rendering.render import corner_rays, render_photograph
+from sfm.products.rendering.scene import Optics
 from sfm.survey.adjusting.solution_remarks import datum_remarks, missing_control, remarks_on_uncalibrated
 from sfm.survey.diagnosis.codes_found import missing_plates
 from sfm.survey.inputs.calibration import plate_control
@@ -26,7 +29,7 @@ from sfm.survey.inputs.survey import Survey, read_survey
 from sfm.targets.codes.plates import BOARDS, TAGGED, PlateFamily
 from sfm.targets.detect import find_targets
 from tests.findings import findings_of
-from tests.plates import SURVEY, camera
+from tests.plates import SURVEY, camera, plate_scene, stations
 from tests.survey.seen_plates import FREE, SIGMA_PX, Plates, about, plates_survey, run_plates
 from tests.surveys import survey_of
 from tests.synthetic import make_network, perturb, seed_of
@@ -232,3 +235,32 @@ def test_a_board_that_is_not_found_is_sought_by_the_keys_that_it_has(codes: str)
     assert {"rows", "columns"} <= words or codes == "grid"
     assert ({"dictionary", "tag_size", "first_tag"} <= words) == (codes in TAGGED)
     assert codes in TAGGED or not {"dictionary", "tag_size", "first_tag"} & words
+
+
+def test_photographs_of_another_board_are_named_with_its_size(tmp_path: Path) -> None:
+    """A smaller board beside the stated one; a photograph without any board is listed by itself."""
+    lens = camera()
+    paths = []
+    for size in ((6, 9), (5, 8), None):
+        shown = np.full((600, 800), 128, np.uint8)
+        if size is not None:
+            board = PlateFamily("checkerboard", *size)
+            scene, rays = plate_scene(board), corner_rays(lens)
+            optics = Optics(blur_px=0.8, exposure=0.9, noise=0.01, oversampling=3)
+            rng = seed_of(f"another board {size}")
+            position, rotation = (of_all[0] for of_all in stations(rng, 1, board))
+            shown, _ = render_photograph(scene, lens, position, rotation, optics=optics, rng=rng, rays=rays)
+        paths.append(tmp_path / f"{len(paths)}.png")
+        cv2.imwrite(str(paths[-1]), shown)
+    stated = PlateFamily("checkerboard", 6, 9)
+    targets = tuple(
+        find_targets(cv2.imread(str(path), cv2.IMREAD_GRAYSCALE), polarity="dark", codes=stated)
+        for path in paths
+    )
+    names = tuple(path.name for path in paths)
+    seen = MeasuredPhotographs(names, tuple(paths), np.zeros(3, dtype=np.int64), (lens,), targets, ())
+    other, nothing = missing_plates(stated, seen)
+    assert other.names("photographs") == ("1.png",) and other.names("other") == ("5 x 8",)
+    assert "It shows a checkerboard of 5 x 8." in other.text
+    assert nothing.names("photographs") == ("2.png",) and not nothing.names("other")
+    assert "shows a checkerboard" not in nothing.text

@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import statistics
 from collections.abc import Iterator, Mapping, Sequence
+from pathlib import Path
 from typing import NamedTuple
 
 import cv2
@@ -16,6 +17,7 @@ import numpy as np
 
 from sfm.model.conventions import AnyArray, FloatArray, IntArray
 from sfm.model.display import agreeing, counted, listed
+from sfm.model.errors import PhotographError
 from sfm.model.remarks.remark import Remark, remark
 from sfm.orientation.image_rays import PLANAR_POINTS
 from sfm.orientation.incremental.sequence import MIN_POINTS
@@ -23,11 +25,12 @@ from sfm.photographs.reading import read_photograph
 from sfm.survey.inputs.measurements import MeasuredPhotographs
 from sfm.survey.inputs.survey import Survey
 from sfm.targets.codes.dot_plates import MIN_DOTS
+from sfm.targets.codes.plate_search import part_of_checkerboard
 from sfm.targets.codes.plates import Family, PlateFamily, TargetFamily, plates_of, points_of_plates
 from sfm.targets.codes.rings import RINGS
 from sfm.targets.codes.tags import CORNERS, DICTIONARIES, find_tags, tag_family
 from sfm.targets.detect import Targets, find_targets
-from sfm.targets.outlines import Flag, scale_of
+from sfm.targets.outlines import Flag, as_bytes, scale_of
 
 MIN_VIEWS = 2  # photographs that show where a missing side of a plate should be
 MIN_TAGS = (
@@ -62,6 +65,13 @@ def missing_plates(family: TargetFamily | None, photographs: MeasuredPhotographs
         strange = [name for name in dots if dots[name] >= MIN_DOTS]
         missing = [name for name in dots if dots[name] < MIN_DOTS]
         size = f"{plate.rows} x {plate.columns}"
+        if plate.name == "checkerboard":
+            path_of = dict(zip(photographs.names, photographs.paths, strict=True))
+            for other, showing in _other_boards({name: path_of[name] for name in missing}, plate).items():
+                missing = [name for name in missing if name not in showing]
+                remarks.append(
+                    remark("plate_not_found", plate=plate.name, photographs=showing, size=size, other=other)
+                )
         if missing:
             kind = "board_not_found" if plate.dictionary else "plate_not_found"
             remarks.append(remark(kind, plate=plate.name, photographs=missing, size=size))
@@ -71,6 +81,20 @@ def missing_plates(family: TargetFamily | None, photographs: MeasuredPhotographs
                 remark("plate_not_found", plate=plate.name, photographs=strange, dots=many, size=size)
             )
     return tuple(remarks)
+
+
+def _other_boards(paths: dict[str, Path], plate: PlateFamily) -> dict[str, list[str]]:
+    """Return the sizes of other whole checkerboards, and the photographs that show them."""
+    showing: dict[str, list[str]] = {}
+    for name, path in paths.items():
+        try:
+            photograph = read_photograph(path)
+        except (PhotographError, OSError):
+            continue  # it was there when it was measured
+        part = part_of_checkerboard(as_bytes(photograph, scale_of(photograph)))
+        if part is not None and not any(part[1]) and sorted(part[0]) != sorted((plate.rows, plate.columns)):
+            showing.setdefault(f"{min(part[0])} x {max(part[0])}", []).append(name)
+    return showing
 
 
 def sides_not_found(family: TargetFamily | None, photographs: MeasuredPhotographs) -> tuple[Remark, ...]:

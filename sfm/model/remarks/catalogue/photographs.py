@@ -162,11 +162,12 @@ ROWS = (
         "plate_not_found",
         "note",
         "The {plate:@} of {size} was not found in {photographs:photograph}[[, where {dots:dot} "
-        "{dots:does|do} not fit it]]: {photographs}.",
+        "{dots:does|do} not fit it]]: {photographs}.[[ {photographs:It shows|They show} a checkerboard of "
+        "{other}.]]",
         "it is cut off or hidden, its marks are hidden or blurred, or rows and columns are not those of the "
         "plate; of a checkerboard they count crossings",
-        "Show all of it with its rim, larger; check rows, columns, marks and polarity, or run kolinear "
-        "init on the folder.",
+        "Show all of it with its rim, larger; move photographs of another board to a folder of their own; "
+        "check rows, columns, marks and polarity, or run kolinear init on the folder.",
         explains=("photograph_with_few_points",),
     ),
     Kind(
