@@ -17,7 +17,7 @@ import numpy as np
 
 from sfm.adjustment.result import MIN_SIGMA_PX, Adjustment
 from sfm.model.camera import camera_families
-from sfm.model.conventions import FloatArray, IntArray
+from sfm.model.conventions import BoolArray, FloatArray, IntArray
 
 LAST_CHANGE = 1e-3  # relative change of a variance component at which the estimation ends
 LAST_CHANGE_OF_PARTS = 0.01  # the same for a covariance of two parts, and for the share of one part
@@ -226,7 +226,11 @@ def _secant_steps(tried: FloatArray, missing: list[FloatArray]) -> FloatArray:
 
 
 def estimate_common_part(
-    adjust_with: Callable[[FloatArray], Adjustment], covariance: FloatArray, common_px: float
+    adjust_with: Callable[[FloatArray], Adjustment],
+    covariance: FloatArray,
+    common_px: float,
+    *,
+    rows: BoolArray | None = None,
 ) -> tuple[float, float]:
     """Return the factor on stated standard deviations of image points, and the sigma of a common part.
 
@@ -239,6 +243,7 @@ def estimate_common_part(
         adjust_with: adjusts a network with covariances of its image points, px^2, (k, 2, 2).
         covariance: stated covariances C, px^2, (k, 2, 2).
         common_px: start value of s, px.
+        rows: which image points of the adjusted network these are; all if not given.
 
     Returns:
         f, which may be 0, and s, at least MIN_SIGMA_PX; after MAX_ROUNDS the last values.
@@ -251,11 +256,12 @@ def estimate_common_part(
     for _ in range(MAX_ROUNDS):
         C = np.einsum("p,pkab->kab", squares, parts)
         adjustment = adjust_with(C)
-        used = ~adjustment.rejected
+        of_parts = slice(None) if rows is None else rows
+        used = ~adjustment.rejected[of_parts]
         P = np.linalg.inv(C[used])
         PV = P @ parts[:, used]
-        Pv = np.einsum("kab,kb->ka", P, adjustment.residuals[used])
-        redundancy = adjustment.redundancy_numbers[used].mean(axis=1)
+        Pv = np.einsum("kab,kb->ka", P, adjustment.residuals[of_parts][used])
+        redundancy = adjustment.redundancy_numbers[of_parts][used].mean(axis=1)
         S = np.einsum("k,pkab,qkba->pq", redundancy, PV, PV)
         scores = np.einsum("ka,pkab,kb->p", Pv, parts[:, used], Pv)
         before, squares = squares, np.linalg.solve(S, scores)

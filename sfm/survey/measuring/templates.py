@@ -30,6 +30,7 @@ from sfm.survey.measuring.covering_points import (
     FIRST_PHOTOGRAPHS,
     MIN_RAYS,
     TOLERANCE_PX,
+    SquareRays,
     Squares,
     covariance_with_slopes,
     match_squares,
@@ -228,6 +229,7 @@ def _matched(
             enough &= np.bincount(rays.point[rays.image == i], minlength=len(numbers)) > 0
         kept = kept[enough[rays.point]]
         rays, r = measured.image_points.select(kept), measured.correlation[kept]
+        rays = replace(rays, covariance=rays.covariance * _shares_of_noise(measured, i)[kept][:, None, None])
         rays = replace(rays, covariance=covariance_with_slopes(rays, measured.of_slopes[kept]))
         others = rays.image != i
         points[numbers] = met.points
@@ -248,6 +250,25 @@ def _matched(
         mean[kept],
         rays_of[kept],
     )
+
+
+def _shares_of_noise(measured: SquareRays, i: int) -> FloatArray:
+    """Return the noise that a match owes to each image point, over half of that of the match, (k,).
+
+    A window that is smaller than the template shows the texture by fewer pixels, which are used more than
+    once: the variance of its noise is that of the template over the ratio of areas, see `two_photo.judge`.
+
+    Args:
+        measured: rays of templates, with half of the noise of a match each.
+        i: photograph of the templates.
+    """
+    seen = measured.image_points
+    smaller = np.maximum(1.0, 1.0 / measured.scale**2)
+    of_template, others = 2.0 / (1.0 + smaller), seen.image != i
+    n = int(seen.point.max(initial=-1)) + 1
+    total = np.bincount(seen.point[others], of_template[others], minlength=n)
+    mean = total / np.maximum(np.bincount(seen.point[others], minlength=n), 1)
+    return np.where(others, 2.0 - of_template, mean[seen.point])
 
 
 def _most_alike(candidates: _Matched, pixels: FloatArray, levels: Levels) -> tuple[ImagePoints, IntArray]:

@@ -5,7 +5,7 @@ Photographs and points are joined by their names. A point that several sources m
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from contextlib import nullcontext
 from dataclasses import dataclass, replace
 from importlib import import_module
@@ -15,7 +15,7 @@ from typing import cast
 import numpy as np
 
 from sfm.adjustment.quality.correlations import design_effect_of_neighbours
-from sfm.adjustment.quality.variance_components import estimate_components
+from sfm.adjustment.quality.variance_components import estimate_common_part, estimate_components
 from sfm.adjustment.result import Adjustment
 from sfm.adjustment.solve import AdjustmentOptions, adjust
 from sfm.judgement.survey_result import LeftOutPoint, PhotographTargets
@@ -32,7 +32,7 @@ from sfm.photographs.reading import decoding_once
 from sfm.runtime.progress import Progress, StageClock
 from sfm.survey.inputs.measurements import NO_NAMES, Measurements, Naming, PhotographList
 from sfm.survey.inputs.settings import AdjustSettings
-from sfm.survey.inputs.sources import Declared, declared
+from sfm.survey.inputs.sources import MARKS, Declared, declared
 from sfm.survey.inputs.start import network_of, scale_bars
 from sfm.survey.inputs.survey import Survey
 from sfm.survey.inputs.survey_file import SurveyFile
@@ -477,8 +477,9 @@ def _balanced(network: Network, estimate: Estimate, min_rays: IntArray, settings
 
     The median covariance does not change: sigma0 still shows how much worse the image points are than
     expected. A source with errors in common gets its design effect. Of very many points only some take part.
+    Named points are weighted by the covariance of their windows, as far as their residuals confirm it.
     """
-    seen, start = network.image_points, estimate
+    start = estimate
 
     def adjust_with(part: Network, factor: FloatArray) -> Adjustment:
         nonlocal start
@@ -502,6 +503,7 @@ def _balanced(network: Network, estimate: Estimate, min_rays: IntArray, settings
             return network
         factors = np.ones(len(network.sources))
         factors[present] = of_groups
+        shown = _with_matching(network, part, factors, adjust_with, settings.sigma_px)
         common = np.array([source.has_common_errors for source in network.sources])
         effect = 1.0
         if common.any() and not common.all():
@@ -513,12 +515,58 @@ def _balanced(network: Network, estimate: Estimate, min_rays: IntArray, settings
             effect = design_effect_of_neighbours(adjust_with(part, factors[part.source]), density=density)
     except GeometryError:  # the adjustment of the survey reports or repairs it
         return network
-    network = with_weights(network, factors[network.source][:, None, None] ** 2 * seen.covariance)
+    network = with_weights(network, shown)
     sources = tuple(
         replace(source, design_effect=effect) if source.has_common_errors else source
         for source in network.sources
     )
     return replace(network, sources=sources)
+
+
+def _with_matching(
+    network: Network,
+    part: Network,
+    factors: FloatArray,
+    adjust_with: Callable[[Network, FloatArray], Adjustment],
+    sigma_px: float,
+) -> FloatArray:
+    """Return covariances with the factors of the sources; those of named points have two parts, (k, 2, 2).
+
+    What matching states differs from window to window, and the sigma expected of any image point would hide
+    it. A factor of it and a common part are estimated in its place.
+
+    Args:
+        network: network of k image points.
+        part: the image points that take part in the estimation.
+        factors: on the standard deviations of each source.
+        adjust_with: adjusts a network with factors of its image points.
+        sigma_px: in all covariances, beside what matching states, px.
+
+    Raises:
+        GeometryError: fewer than two photographs keep enough points.
+    """
+    shown = factors[network.source][:, None, None] ** 2 * network.image_points.covariance
+    named = np.array([source.name == MARKS.name for source in network.sources])
+    expected, of_named = sigma_px**2 * np.eye(2), named[part.source]
+    matching = part.image_points.covariance[of_named] - expected
+    if not len(matching):
+        return np.asarray(shown)
+    of_part = factors[part.source][:, None, None] ** 2 * part.image_points.covariance
+
+    def adjust_matching(covariance: FloatArray) -> Adjustment:
+        of_part[of_named] = covariance
+        weighted = replace(part, image_points=replace(part.image_points, covariance=of_part.copy()))
+        return adjust_with(weighted, np.ones(len(of_part)))
+
+    common_px = float(factors[named][0]) * sigma_px
+    try:
+        factor, common_px = estimate_common_part(adjust_matching, matching, common_px, rows=of_named)
+    except np.linalg.LinAlgError:  # windows that are all alike do not tell the parts of their errors
+        return np.asarray(shown)
+    rows = named[network.source]
+    matched = network.image_points.covariance[rows] - expected
+    shown[rows] = factor**2 * matched + common_px**2 * np.eye(2)
+    return np.asarray(shown)
 
 
 def _thinned(

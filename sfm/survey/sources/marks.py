@@ -3,11 +3,13 @@
 What the person marks is a template: the window around the place. The point is what the middle of this window
 shows. Therefore its image point in the photograph of the template has no error of pointing, and the point is
 the same in every run, and in every epoch that uses this template. Least squares matching measures it in the
-others. A match has the noise of both windows: half of its covariance is that of its image point, and the
-other half, common to all, that of the image point of the template. The standard deviations are those of the
-displacement of the point between epochs. Its coordinates have the noise of the template beside, about 0.02
-px, which is the same in all epochs. What the person means by the name may lie beside it by the error of
-pointing, about a pixel; a bar to this point has that error too.
+others. A match has the noise of both windows: half of its covariance, or more where its window is smaller
+than the template, is that of its image point. The rest, common to all, is that of the image point of the
+template. The standard deviations are those of the displacement of the point between epochs. Residuals of all
+named points give the factor of these covariances, and the part of the errors that no match sees (`joined`).
+Its coordinates have the noise of the template beside, about 0.02 px, which is the same in all epochs. What
+the person means by the name may lie beside it by the error of pointing, about a pixel; a bar to this point
+has that error too.
 
 Marks of a point in further photographs, with the sigma of pointing, show where it is: they may orient these
 photographs, they decide where a pattern looks alike at several places, and they stay where nothing is
