@@ -32,7 +32,7 @@ from sfm.photographs.reading import decoding_once
 from sfm.runtime.progress import Progress, StageClock
 from sfm.survey.inputs.measurements import NO_NAMES, Measurements, Naming, PhotographList
 from sfm.survey.inputs.settings import AdjustSettings
-from sfm.survey.inputs.sources import MARKS, Declared, declared
+from sfm.survey.inputs.sources import Declared, declared
 from sfm.survey.inputs.start import network_of, scale_bars
 from sfm.survey.inputs.survey import Survey
 from sfm.survey.inputs.survey_file import SurveyFile
@@ -532,8 +532,9 @@ def _with_matching(
 ) -> FloatArray:
     """Return covariances with the factors of the sources; those of named points have two parts, (k, 2, 2).
 
-    What matching states differs from window to window, and the sigma expected of any image point would hide
-    it. A factor of it and a common part are estimated in its place.
+    Named points are matched windows whose neighbours have no error in common. What matching states differs
+    from window to window, and the sigma expected of any image point would hide it. A factor of it and a
+    common part are estimated in its place.
 
     Args:
         network: network of k image points.
@@ -546,7 +547,7 @@ def _with_matching(
         GeometryError: fewer than two photographs keep enough points.
     """
     shown = factors[network.source][:, None, None] ** 2 * network.image_points.covariance
-    named = np.array([source.name == MARKS.name for source in network.sources])
+    named = np.array([source.is_matched and not source.has_common_errors for source in network.sources])
     expected, of_named = sigma_px**2 * np.eye(2), named[part.source]
     matching = part.image_points.covariance[of_named] - expected
     if not len(matching):
