@@ -89,7 +89,7 @@ def run_survey_file(survey_file: Path, options: RunOptions) -> Path:
         from sfm.survey.inputs.measurements import find_photographs
         from sfm.survey.inputs.named_folders import named_folder
         from sfm.survey.inputs.photograph_names import name_photographs
-        from sfm.survey.inputs.sources import reads_photographs
+        from sfm.survey.inputs.sources import declared, reads_photographs
         from sfm.survey.inputs.survey import survey_of_file, with_calibration
         from sfm.survey.inputs.survey_file import read_survey_file
         from sfm.survey.measuring.measured_store import MeasuredStore
@@ -103,7 +103,8 @@ def run_survey_file(survey_file: Path, options: RunOptions) -> Path:
         from_photographs = reads_photographs(described)
     if from_photographs and not reads_photographs(described):
         raise KolinearError(
-            f"{survey_file}: has [observations] instead of photographs; run kolinear adjust {survey_file}, "
+            f"{survey_file}: has {' and '.join(row.section for row in declared(described))} instead of "
+            f"photographs; run kolinear adjust {survey_file}, "
             "or write [[observations]] for image points beside targets or texture"
         )
     if not from_photographs and reads_photographs(described):

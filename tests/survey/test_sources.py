@@ -269,7 +269,7 @@ def test_a_new_source_is_one_module_and_one_row(monkeypatch: pytest.MonkeyPatch)
             replace(second, points=points), truth.cameras, second.images, np.full(len(points), 2)
         )
 
-    row = Declared(Source("sensor", names_last=False), "name", lambda _: "a sensor")
+    row = Declared(Source("sensor", names_last=False), "name", "[sensor]", lambda _: "a sensor")
     beside = tuple(replace(other, is_alone=lambda settings: False) for other in sources.ROWS)
     monkeypatch.setattr(sources, "ROWS", (*beside, row))
     module = SimpleNamespace(SOURCE=SurveySource(measure, complete_as_measured))  # type: ignore[arg-type]

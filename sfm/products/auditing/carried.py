@@ -23,15 +23,13 @@ from sfm.model.solution import Solution
 from sfm.survey.inputs.cameras import cameras_of_images
 from sfm.survey.inputs.exterior_table import MIN_COS_PHI, ObservedExterior
 from sfm.survey.inputs.settings import CameraSettings, CompareSettings, RigSettings, TargetSettings
+from sfm.survey.inputs.sources import ROWS as SOURCES
 from sfm.survey.inputs.survey import CameraSetup, Survey
 
 # what a survey file may have besides, by the fields of a survey
 OTHER_SECTIONS = {
-    "targets": "[targets]",
+    **{row.table: row.section for row in SOURCES},
     "plates": "[[plate]]",
-    "tie_points": "[tie_points]",
-    "observations": "[observations]",
-    "marks": "[[point]]",
     "start_orientations": "[approximate] images",
     "start_points": "[approximate] points",
     "start_cameras": "[approximate] cameras",

@@ -39,6 +39,7 @@ class Declared:
 
     source: Source
     table: str  # attribute of surveys with the settings of its table in the survey file
+    section: str  # how the survey file writes this table
     describe: Callable[[Any], str]  # the settings of the table in a few words
     stage: str = ""  # stage of the pipeline that measures it in photographs; empty if nothing is measured
     is_stated: Callable[[Any], bool] = lambda settings: settings is not None
@@ -50,6 +51,7 @@ ROWS = (  # in the order of their points in a network; the first is that of a su
     Declared(
         TARGETS,
         "targets",
+        "[targets]",
         lambda targets: f"targets of codes {targets.codes}",
         "targets",
         lambda targets: targets.codes != "none",
@@ -57,6 +59,7 @@ ROWS = (  # in the order of their points in a network; the first is that of a su
     Declared(
         GIVEN,
         "observations",
+        "[observations]",
         lambda given: counted(sum(map(len, tables_of(given))), "image point"),
         is_stated=lambda given: bool(tables_of(given)),
         is_alone=lambda given: not isinstance(given, tuple),  # one table, in place of photographs
@@ -65,12 +68,13 @@ ROWS = (  # in the order of their points in a network; the first is that of a su
     Declared(
         MARKS,
         "marks",
+        "[[point]]",
         lambda marks: counted(len({mark.name for mark in marks}), "named point"),
         "named points",
         is_stated=bool,
         is_listed=True,
     ),
-    Declared(TEXTURE, "tie_points", lambda _: "tie points of natural texture", "tie points"),
+    Declared(TEXTURE, "tie_points", "[tie_points]", lambda _: "tie points of natural texture", "tie points"),
 )
 
 
