@@ -15,6 +15,7 @@ from sfm.judgement.given import judge as given
 from sfm.judgement.given.free_network import FreeNetwork
 from sfm.judgement.given.groups import GivenSettings
 from sfm.judgement.given.judge import JudgedGiven, judge_given
+from sfm.judgement.given.mounts import judge_mount_scales
 from sfm.judgement.given.tables import Contradiction, Table
 from sfm.model.conventions import angles_from_rotation, rotation_from_vector
 from sfm.model.estimate import Estimate, values_of
@@ -184,6 +185,25 @@ def test_motions_of_unknowns_are_those_of_a_similarity(size: float) -> None:
     bases = np.where(truth.mounts.free[:, :3], values.mount_position, 0.0)
     np.testing.assert_allclose(found[MOUNT][:, :3, 6] * size, bases)
     assert not found[MOUNT][:, 3:].any() and not found[MOUNT][:, :, :6].any() and bases.any()
+
+
+def test_a_mount_without_a_base_has_no_scale_to_judge() -> None:
+    """Nor is one judged where the cameras are on no rig: both are used as they are given."""
+    network, truth = make_rig(seed_of("no base"), moments=4, cameras=3, points=20)
+    assert truth.mounts is not None
+    free = FreeNetwork(adjust(network, truth, datum=Datum("free"), reject="none"))
+    rotation = np.swapaxes(truth.mounts.rotation, 1, 2)[1:]
+    angles = np.array([angles_from_rotation(R) for R in rotation], dtype=float)
+    covariance = np.tile(1e-8 * np.eye(6), (2, 1, 1))
+    for bases in (truth.mounts.position[1:], truth.mounts.position[1:] * [[1.0], [0.0]]):
+        mounts = MountObservations(np.array([1, 2]), bases, angles, covariance)
+        reference = free.reference_of([mounts])
+        assert reference is not None
+        found, said = judge_mount_scales(mounts, network, reference, lambda _: UNCHANGED, 1e-3)
+        assert found is mounts and said == ()
+    long = mounts.with_values(np.hstack([truth.mounts.position[1:] * [[1.0], [1.5]], angles]))
+    found, said = judge_mount_scales(long, network, reference, lambda _: UNCHANGED, 1e-3)
+    assert kinds_of(said) == ("scale_contradicted",) and len(found) == 0
 
 
 @pytest.mark.parametrize("scale", [0.1, 8.0])

@@ -146,7 +146,7 @@ LIMITS: dict[
     "given_scatter": ("share", 0.2, None),
     "photographs_missing": ("share", 0.0, 0.5),
     "c_far_from_given": ("share", 5e-4, None),
-    "c_hardly_determined": ("share", 0.05, 1 / 3),
+    "c_hardly_determined": ("share", 0.05, 0.2),
     "camera_not_calibrated": ("rms", 0.51, 1.0),
     "margin_not_calibrated": ("rms", 0.51, 1.0),
     "principal_point_far": ("share", 0.1, None),

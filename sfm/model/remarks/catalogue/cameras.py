@@ -115,9 +115,9 @@ ROWS = (
     ),
     Kind(
         "c_hardly_determined",
-        # A warning if EXIF data and the sensor size give c equally well; an error if 3 standard deviations
-        # reach c = 0.
-        Grade("share", warning=0.05, error=1 / 3),
+        # A warning if EXIF data and the sensor size give c equally well; an error if a result may be off by
+        # as much as c itself.
+        Grade("share", warning=0.05, error=1 / WRONG_SIGMAS),
         "{parameter} of camera {camera} is known only to {share:%}[[, strongly correlated with {partners}]].",
         "a long lens, few photographs, or small angles between them",
         "Hold it fixed at a calibrated value, or add photographs at larger angles and other distances.",
