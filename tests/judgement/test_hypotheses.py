@@ -466,6 +466,7 @@ def test_two_causes_are_adjusted_together() -> None:
     assert "image 11" in places and places & {"image 5", "image 6"}
     for one in found:
         assert one.number("distance") == pytest.approx(2e-3, rel=0.15)
+        assert 1 < one.number("shift") < 100  # what each does while the other's effect is removed
 
 
 def test_a_large_error_is_named_and_not_what_has_most_parameters() -> None:
