@@ -14,7 +14,7 @@ from sfm.adjustment.datum import Datum
 from sfm.adjustment.engine import iterate, normals
 from sfm.adjustment.engine.cofactors import hat_complement, marginal_covariance
 from sfm.adjustment.engine.normals import MIN_HALVED_POINTS, Equations
-from sfm.adjustment.engine.solvers import choice, multifrontal_factor
+from sfm.adjustment.engine.solvers import choice
 from sfm.adjustment.engine.solvers.choice import choose_solver
 from sfm.adjustment.engine.solvers.dense import DenseFactor, DenseSolver
 from sfm.adjustment.engine.solvers.fronts import LEAF, dissect, pairs_of
@@ -140,7 +140,6 @@ def test_a_camera_for_each_photograph_has_the_covariance_of_full_rows(
     cameras = tuple(replace(lens(("c", "K1")), name=f"camera {k}") for k in range(m))
     network, truth = replace(network, camera=np.arange(m)), replace(truth, cameras=cameras)
     a = run(network, truth, covariance=False, tolerance=1e-9)
-    monkeypatch.setattr(multifrontal_factor, "MOST_VALUES", 3 * 2 * m * 16)
     fronts = marginal_of(a, datum=Datum("free"))
     monkeypatch.setattr(iterate, "choose_solver", DenseSolver)
     full = marginal_of(a, datum=Datum("free"))

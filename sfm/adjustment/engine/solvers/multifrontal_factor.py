@@ -30,7 +30,9 @@ from sfm.model.conventions import AnyArray, FloatArray, IntArray
 from sfm.runtime.compiling import kernel
 from sfm.runtime.small_algebra import add_product
 
-MOST_VALUES = 2**22  # values of object points by interior and kept unknowns at a time, 32 MB
+# Object points multiplied by the inverse of interior and kept unknowns at a time: so many values,
+# 32 kB, and so few points that the inverse is not read again for each.
+MOST_VALUES, FEWEST_POINTS = 2**12, 16
 
 
 class EliminatedFront(NamedTuple):
@@ -111,7 +113,7 @@ class MultifrontalFactor:
         core, exterior = np.zeros((n, 3, 3)), np.empty((len(b.U), 6, 6))
         YQ = np.zeros((len(b.Y) if cross else most, 3, 6))
         YQ_border = np.zeros((n if cross else 1, 3, border))
-        together = max(1, MOST_VALUES // max(3 * border, 1))  # points multiplied by Q at once
+        together = max(FEWEST_POINTS, MOST_VALUES // max(3 * border, 1))
         for front, Z in self._inverse_fronts():
             scale = s[front.rows]
             Z_own = Z * scale
@@ -124,9 +126,10 @@ class MultifrontalFactor:
                 points = front.points[begin : begin + together]
                 u = np.empty((len(points), 3, border))
                 _by_border(observations, points, b.Y, b.Y_interior, X, u)
+                uQ = (u.reshape(3 * len(points), border) @ Q).reshape(u.shape)
                 _sum_pairs(
                     observations, points, self.fronts.local, b.Y, b.Y_interior, Z_own.reshape(-1),
-                    len(Z_own), X, (u.reshape(-1, border) @ Q).reshape(u.shape), cross, core, YQ, YQ_border,
+                    len(Z_own), X, uQ, cross, core, YQ, YQ_border,
                 )  # fmt: skip
         if not cross:
             YQ, YQ_border = YQ[:0], YQ_border[:0]
