@@ -16,6 +16,7 @@ from sfm.model.conventions import FloatArray
 from sfm.model.distortion.models import Role
 from sfm.model.estimate import Estimate
 from sfm.model.network import ImagePoints, Network
+from sfm.model.reduced_network import reduce_network
 from sfm.model.remarks.remark import of_kind
 from sfm.model.similarity import fit_similarity
 from sfm.orientation.incremental.sequence import Orientation
@@ -163,6 +164,20 @@ def test_a_photograph_that_the_adjustment_loses_stays_where_it_was() -> None:
         assert np.array_equal(kept.position[2], truth.position[2])
         assert np.array_equal(kept.position[[0, 1, 3]], adjusted.estimate.position[[0, 1, 3]])
         assert kept.oriented.all()
+
+
+def test_a_photograph_that_takes_no_part_in_an_adjustment_stays_where_it_was() -> None:
+    network, truth = make_network(seed_of("too few of its own"), images=4, points=12)
+    images, points = np.arange(4) != 1, np.arange(12) != 5
+    everything = np.ones(len(network.image_points), dtype=bool)
+    part, start = reduce_network(network, truth, images, points, everything)
+    adjusted = adjust(part, start, datum=Datum("free"), reject="none")
+    kept = restore_strayed(truth, adjusted, images, points, tolerance_px=2.0)
+    assert np.array_equal(kept.position[1], truth.position[1])
+    assert np.array_equal(kept.points[5], truth.points[5])
+    alone = replace(truth, position=np.where(images[:, None], truth.position, np.nan))
+    kept = restore_strayed(alone, adjusted, images, points, tolerance_px=2.0)
+    assert not kept.oriented[1] and not kept.determined[5]
 
 
 SIZE_PX = (640, 480)

@@ -22,6 +22,7 @@ from sfm.model.conventions import AnyArray
 from sfm.model.network import ImagePoints, Source
 from sfm.model.similarity import fit_similarity
 from sfm.photographs import reading
+from sfm.photographs.reading import read_photograph
 from sfm.pipeline import run_survey
 from sfm.products.rendering.render import render_photographs
 from sfm.products.rendering.scene import Optics, join_marks, rectangles
@@ -35,6 +36,7 @@ from sfm.survey.sources.joined import _measure_each, measure_sources
 from sfm.survey.sources.repeated import OfOneSource, without_repeated
 from sfm.survey.sources.source import SurveySource, complete_as_measured
 from sfm.survey.target_network import measure_targets
+from sfm.targets.detect import find_targets
 from tests.places import ROOT
 from tests.surveys import SURVEY, camera, code_centres, plates, stations, survey_of
 from tests.synthetic import make_network, seed_of
@@ -108,23 +110,47 @@ def test_targets_and_texture_are_one_survey(tmp_path: Path) -> None:
     assert len(first.xy) > len(alone.photographs[0].xy)
 
 
-def test_targets_too_few_to_orient_anything_stand_beside_texture(tmp_path: Path) -> None:
-    """Two targets in each photograph: texture orients the photographs, and the targets are points of it."""
-    path, truth = write(tmp_path, "[tie_points]\n"), code_centres()
-    shown = sorted(truth)[:2]
+def paint_over(folder: Path, photographs: range, shown: list[int]) -> None:
+    """Paint over the coded targets of photographs, counted from 1, except those shown."""
     for i, (at, R) in enumerate(zip(*stations(6), strict=True), 1):
-        picture = cv2.imread(str(tmp_path / f"photo {i}.png"), cv2.IMREAD_GRAYSCALE)
-        for code, X in truth.items():
+        if i not in photographs:
+            continue
+        picture = cv2.imread(str(folder / f"photo {i}.png"), cv2.IMREAD_GRAYSCALE)
+        for code, X in code_centres().items():
             if code not in shown:
                 x, y = project(camera(), at, R, X[None])[0]
                 cv2.circle(picture, (round(x), round(y)), 32, 110, -1)
-        cv2.imwrite(str(tmp_path / f"photo {i}.png"), picture)
+        cv2.imwrite(str(folder / f"photo {i}.png"), picture)
+
+
+def test_targets_too_few_to_orient_anything_stand_beside_texture(tmp_path: Path) -> None:
+    """Two targets in each photograph: texture orients the photographs, and the targets are points of it."""
+    path, shown = write(tmp_path, "[tie_points]\n"), sorted(code_centres())[:2]
+    paint_over(tmp_path, range(1, 7), shown)
     result = run_survey(read_survey(path))
     network = result.adjustment.network
     assert len(network.images) == 6 and result.adjustment.estimate.oriented.all()
     assert set(map(str, shown)) <= set(network.points)
     rows = [network.points.index(str(code)) for code in shown]
     assert (network.rays()[rows] >= 3).all() and (network.source == 1).sum() > 500
+
+
+def test_photographs_that_texture_orients_keep_their_few_targets(tmp_path: Path) -> None:
+    """Fewer targets than orient a photograph took no part where other photographs showed enough of them."""
+    path = write(tmp_path, "[tie_points]\n")
+    paint_over(tmp_path, range(4, 7), sorted(code_centres())[::7])
+    result = run_survey(read_survey(path))
+    network = result.adjustment.network
+    assert len(network.images) == 6 and result.adjustment.estimate.oriented.all()
+    seen = network.image_points
+    few = 0
+    for i, name in enumerate(network.images):
+        code = find_targets(read_photograph(tmp_path / name), codes="ring14").code
+        read = set(map(str, code[code >= 0].tolist()))
+        if 0 < len(read) < 4:
+            few += 1
+            assert read <= {network.points[j] for j in seen.point[seen.image == i].tolist()}
+    assert few == 3
 
 
 def test_photographs_are_decoded_as_often_as_for_one_source(

@@ -17,8 +17,8 @@ from sfm.model.conventions import MAD_TO_SIGMA, BoolArray
 from sfm.model.errors import GeometryError
 from sfm.model.estimate import Estimate
 from sfm.model.network import Network, rows_of, without_given
-from sfm.model.reduced_network import MIN_IMAGE_POINTS, merge_estimate, reduce_network, select_determined
-from sfm.model.remarks.remark import Remark, remark
+from sfm.model.reduced_network import merge_estimate, reduce_network, select_determined
+from sfm.model.remarks.remark import Remark
 from sfm.orientation.incremental.growth import residual_lengths
 from sfm.orientation.incremental.sequence import Orientation
 from sfm.orientation.intersection import RayLimits, intersect
@@ -60,13 +60,6 @@ def match_targets_of(
     matched, left_out, contested = _without_other_objects(survey, photographs, naming, start)
     naming, network, estimate = matched.naming, matched.network, matched.estimate
     circles = check_circles(survey, photographs, naming, network, estimate)
-    named = {name for name, _ in left_out}
-    lost = start.estimate.oriented & ~circles.estimate.oriented
-    left_out += tuple(
-        (photographs.names[i], remark("photograph_with_few_fitting", needed=MIN_IMAGE_POINTS))
-        for i in np.flatnonzero(lost)
-        if photographs.names[i] not in named
-    )
     return Correspondences(
         circles.network,
         circles.estimate,
@@ -180,10 +173,12 @@ def _match_and_adjust(
 def restore_strayed(
     before: Estimate, adjusted: Adjustment, images: BoolArray, points: BoolArray, *, tolerance_px: float
 ) -> Estimate:
-    """Return the adjusted values; photographs that lost their points get their earlier values back.
+    """Return the adjusted values; photographs that lost their points or took no part keep earlier ones.
 
     Robust weights reject a photograph that does not fit, such as a zoomed one. It then moves away until it no
-    longer sees its points. The search for the reason starts from its earlier values.
+    longer sees its points. The search for the reason starts from its earlier values. A photograph that shows
+    too few points to take part is oriented by other image points, by its rig, or by given values. Points that
+    were not adjusted may be seen in it.
 
     Args:
         before: values of all photographs and points before the adjustment.
@@ -196,10 +191,13 @@ def restore_strayed(
     length = np.nan_to_num(np.linalg.norm(adjusted.residuals, axis=1), nan=np.inf)
     of_photograph = rows_of(adjusted.network.image_points.image, int(images.sum()))
     median = np.array([np.median(length[rows]) if len(rows) else 0.0 for rows in of_photograph])
-    lost = np.flatnonzero(images)[median > MAX_STRAY * tolerance_px]
-    position, rotation = estimate.position.copy(), estimate.rotation.copy()
-    position[lost], rotation[lost] = before.position[lost], before.rotation[lost]
-    return replace(estimate, position=position, rotation=rotation)
+    as_before = ~images
+    as_before[np.flatnonzero(images)[median > MAX_STRAY * tolerance_px]] = True
+    position, rotation, xyz = estimate.position.copy(), estimate.rotation.copy(), estimate.points.copy()
+    position[as_before], rotation[as_before] = before.position[as_before], before.rotation[as_before]
+    if before.oriented[~images].any():
+        xyz[~points] = before.points[~points]
+    return replace(estimate, position=position, rotation=rotation, points=xyz)
 
 
 def _match_by_photograph_cameras(
