@@ -83,10 +83,11 @@ def run_survey_file(survey_file: Path, options: RunOptions) -> Path:
             refuse_other_origin,
             write_result,
         )
+        from sfm.runtime.forecast import Run, RunHistory, expected_seconds
         from sfm.runtime.progress_bar import drawn_progress
         from sfm.runtime.threads import cores, one_blas_thread
         from sfm.survey.inputs.calibration import Calibration, read_calibrations
-        from sfm.survey.inputs.measurements import find_photographs
+        from sfm.survey.inputs.measurements import NO_PHOTOGRAPHS, find_photographs, work_of
         from sfm.survey.inputs.named_folders import named_folder
         from sfm.survey.inputs.photograph_names import name_photographs
         from sfm.survey.inputs.sources import declared, reads_photographs
@@ -130,6 +131,7 @@ def run_survey_file(survey_file: Path, options: RunOptions) -> Path:
     origin = Origin(survey_file, images or survey_file.parent / (described.photographs or ""))
     if not options.overwrite:
         refuse_other_origin(folder, origin, survey=survey.name, photographs=from_photographs)
+    files = NO_PHOTOGRAPHS
     if from_photographs:
         files = find_photographs(survey, images_dir=images)
         name_photographs(survey, files)  # wrong folders and names are reported before anything is compiled
@@ -147,6 +149,8 @@ def run_survey_file(survey_file: Path, options: RunOptions) -> Path:
         lock_folder(folder),
         SurveyLog(watch=drawn) as log,
     ):
+        history, work = RunHistory.of_user(), work_of(survey, files)
+        drawn.countdown.expected = expected_seconds(work, history.read())
         log.start(survey.name, survey_file, **origin.written(folder))
         with reporting_unfinished(folder, log, jobs=workers):
             result = run_survey(
@@ -174,6 +178,8 @@ def run_survey_file(survey_file: Path, options: RunOptions) -> Path:
             progress=log,
             plot_process=plots,
         )
+        if store is None or not store.has_earlier:
+            history.add(Run(work, drawn.finished()))
     seconds = time.perf_counter() - begun
     if options.product is not None:
         dependable = options.product.show(folder)

@@ -10,6 +10,8 @@ from rich.console import Console
 from rich.progress import BarColumn, Progress, ProgressColumn, Task, TaskID, TextColumn
 from rich.text import Text
 
+from sfm.runtime.forecast import Countdown
+
 
 @contextmanager
 def drawn_progress(console: Console | None = None) -> Iterator[DrawnProgress]:
@@ -19,26 +21,27 @@ def drawn_progress(console: Console | None = None) -> Iterator[DrawnProgress]:
         console: console in place of stderr.
     """
     console = console or Console(stderr=True)
+    countdown = Countdown()
     with Progress(
         TextColumn("{task.description:12}"),
         BarColumn(),
         _Counted(),
-        _Times(),
+        _Times(countdown),
         TextColumn("{task.fields[step]}", style="dim"),
         console=console,
         disable=not console.is_terminal,
     ) as bar:
-        drawn = DrawnProgress(bar)
+        drawn = DrawnProgress(bar, countdown)
         yield drawn
-        drawn.stage("done", 1)
-        bar.remove_task(bar.task_ids[-1])
+        drawn.finished()
 
 
 class DrawnProgress:
     """Progress as a bar on the terminal: the stage, its present work, and the finished photographs."""
 
-    def __init__(self, bar: Progress) -> None:
+    def __init__(self, bar: Progress, countdown: Countdown) -> None:
         self._bar = bar
+        self.countdown = countdown
         self._task: TaskID | None = None
 
     def stage(self, name: str, total: int | None = None) -> None:
@@ -46,11 +49,20 @@ class DrawnProgress:
         if self._task is not None:
             task = self._bar.tasks[-1]
             if task.description == name:
-                self._bar.update(self._task, total=total, counted=total is not None)
+                self._bar.update(self._task, total=total, parts=total)
                 return
             self._bar.update(self._task, total=task.total or 1, completed=task.total or 1, step="")
             self._bar.stop_task(self._task)
-        self._task = self._bar.add_task(name, total=total, step="", part="", counted=total is not None)
+            self.countdown.finish(task.description, task.elapsed or 0.0)
+        self._task = self._bar.add_task(name, total=total, step="", part="", parts=total)
+
+    def finished(self) -> dict[str, float]:
+        """End the last stage, and return the time of each, s."""
+        if self._task is not None:
+            self.stage("done", 1)
+            self._bar.remove_task(self._bar.task_ids[-1])
+            self._task = None
+        return self.countdown.taken
 
     def advance(self, step: str = "") -> None:
         """Count one step and name it."""
@@ -77,14 +89,18 @@ class _Counted(ProgressColumn):
 
     def render(self, task: Task) -> Text:
         """Return the text of the column."""
-        known = task.total is not None and (task.fields["counted"] or task.stop_time is None)
+        known = task.total is not None and (task.fields["parts"] or task.stop_time is None)
         return Text(f"{int(task.completed)}/{int(task.total or 0)}" if known else "", "progress.download")
 
 
 class _Times(ProgressColumn):
-    """Time since the stage began, and the estimated remaining time if the number of parts is known."""
+    """Time since the stage began, and estimates of what is left of it and of all stages."""
 
     max_refresh = 0.5  # s
+
+    def __init__(self, countdown: Countdown) -> None:
+        super().__init__()
+        self._countdown = countdown
 
     def render(self, task: Task) -> Text:
         """Return the text of the column."""
@@ -92,6 +108,12 @@ class _Times(ProgressColumn):
         left = task.time_remaining
         if left and not task.finished:
             text.append(f", about {_clock(left)} left", "progress.remaining")
+        if task.stop_time is None:
+            parts = task.fields["parts"]
+            share = task.completed / parts if parts and task.total == parts else None
+            of_all = self._countdown.left(task.description, task.elapsed or 0.0, share)
+            if of_all is not None:
+                text.append(f", {_clock(of_all)} to the end", "progress.remaining")
         return text
 
 

@@ -22,8 +22,10 @@ from sfm.model.network import Network
 from sfm.model.remarks.remark import Remark, remark
 from sfm.photographs.exif import Metadata, read_metadata
 from sfm.photographs.masks import Masks
+from sfm.runtime.forecast import Work
 from sfm.survey.inputs.cameras import refuse_ungrouped
 from sfm.survey.inputs.settings import MAX_PHOTOGRAPHS, CameraSettings
+from sfm.survey.inputs.sources import declared, given_tables
 from sfm.survey.inputs.survey_file import SurveyFile
 from sfm.targets.codes.tags import CORNERS
 from sfm.targets.detect import Targets
@@ -61,6 +63,22 @@ class PhotographList:
 
     def __len__(self) -> int:
         return len(self.names)
+
+
+def work_of(survey: Survey, files: PhotographList) -> Work:
+    """Return what the time of a survey depends on.
+
+    Args:
+        survey: the survey.
+        files: its photographs; none if it measures nothing.
+    """
+    metadata = files.metadata_of(0) if len(files) else None
+    images = {image for table in given_tables(survey) for image in table.image}
+    return Work(
+        tuple(row.source.name for row in declared(survey)),
+        len(files) or len(images),
+        0.0 if metadata is None else metadata.size_px[0] * metadata.size_px[1] / 1e6,
+    )
 
 
 NO_PHOTOGRAPHS = PhotographList((), (), np.zeros(0, dtype=np.int64), Path())

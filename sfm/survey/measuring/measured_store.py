@@ -63,6 +63,11 @@ class MeasuredStore:
         """
         return cls(user_folder("measured", "measured points"))
 
+    @property
+    def has_earlier(self) -> bool:
+        """Whether measurements of this run were read from the folder."""
+        return any(stored for _, stored in self.held.values())
+
     def load(self, key: str, kind: Kind[M]) -> M | None:
         """Return the measurements under a key; None if they are missing or incomplete."""
         if self.folder is None:

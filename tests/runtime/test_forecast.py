@@ -1,0 +1,113 @@
+"""How long a survey takes: earlier runs, their scale, and what is left while it runs."""
+
+from __future__ import annotations
+
+import io
+import json
+import math
+from pathlib import Path
+
+import pytest
+from rich.console import Console
+
+from sfm.runtime.forecast import KEPT_RUNS, TYPICAL, Countdown, Run, RunHistory, Work, expected_seconds
+from sfm.runtime.progress_bar import drawn_progress
+from sfm.survey.inputs.measurements import NO_PHOTOGRAPHS, find_photographs, work_of
+from sfm.survey.inputs.survey import read_survey
+from tests.surveys import write_photograph_survey
+
+SMALL = Run(Work(("targets",), 10, 1.0), {"targets": 5.0, "orientation": 1.0, "adjustment": 2.0})
+LARGE = Run(Work(("targets",), 100, 1.0), {"targets": 40.0, "orientation": 30.0, "adjustment": 50.0})
+
+
+def test_the_nearest_run_of_the_same_sources_is_scaled() -> None:
+    work = Work(("targets",), 20, 2.0)
+    expected = expected_seconds(work, [LARGE, SMALL])
+    assert expected == pytest.approx({"targets": 20.0, "orientation": 2.0, "adjustment": 2 * 2**1.2})
+    assert expected_seconds(Work(("targets",), 80, 1.0), [LARGE, SMALL])["targets"] == pytest.approx(32.0)
+    assert expected_seconds(SMALL.work, [SMALL]) == SMALL.seconds
+    again = Run(SMALL.work, {"targets": 7.0})
+    assert expected_seconds(SMALL.work, [SMALL, again]) == again.seconds  # of equals the last
+
+
+def test_without_a_run_of_ones_own_a_typical_one_stands_in_for_each_combination() -> None:
+    for run in TYPICAL:
+        assert expected_seconds(run.work, []) == pytest.approx(run.seconds)
+    elsewhere = Run(Work(("texture",), 11, 6.29), {"tie points": 1.0})
+    assert expected_seconds(SMALL.work, [elsewhere])["targets"] > 0
+    assert expected_seconds(Work(("unheard of",), 3), [SMALL]) == {}
+    assert Work(("given",), 3).distance(Work(("given",), 3, 2.0)) == math.inf  # one of them reads photographs
+
+
+def test_what_is_left_follows_the_stages_that_are_finished() -> None:
+    countdown = Countdown({"targets": 10.0, "orientation": 4.0, "adjustment": 6.0})
+    assert countdown.left("targets", 0.0) == pytest.approx(20.0)
+    assert countdown.left("targets", 12.0) == pytest.approx(10.0)  # later than expected
+    assert countdown.left("targets", 5.0, share=0.25) == pytest.approx(15.0 + 20.0)  # half as fast
+    assert countdown.left("targets", 0.1, share=0.01) == pytest.approx(19.9)  # too few parts to tell
+    countdown.finish("targets", 20.0)
+    assert countdown.left("orientation", 1.0) == pytest.approx(2 * 10.0 - 1.0)
+    countdown.finish("orientation", 8.0)
+    assert countdown.left("adjustment", 0.0) == pytest.approx(12.0)
+    assert countdown.left("report", 3.0) == pytest.approx(12.0)  # not expected: nothing is known of it
+    assert Countdown().left("targets", 1.0) is None
+
+
+def test_stages_that_read_an_earlier_measurement_say_nothing_of_the_others() -> None:
+    countdown = Countdown({"targets": 10.0, "orientation": 4.0, "adjustment": 6.0})
+    countdown.finish("targets", 0.1)
+    assert countdown.left("orientation", 0.0) == pytest.approx(10.0)
+
+
+def test_runs_are_kept_and_damaged_lines_are_passed_over(tmp_path: Path) -> None:
+    history = RunHistory(tmp_path / "runs" / "runs.jsonl")
+    assert history.read() == []
+    history.add(SMALL)
+    history.add(LARGE)
+    assert history.read() == [SMALL, LARGE]
+    good = history.path.read_text("utf-8")
+    for line in ("", "{", "7", "[]", '{"sources": 3}', good.splitlines()[0].replace("5.0", '"x"')):
+        history.path.write_text(f"{line}\n{good}", "utf-8")
+        assert history.read() == [SMALL, LARGE]
+    for number in ("NaN", "Infinity", "-1.0"):
+        history.path.write_text(good.replace("5.0", number), "utf-8")
+        assert history.read() == [LARGE]
+    history.path.write_bytes(b"\xff\xfe")
+    assert history.read() == []
+    for _ in range(3):
+        history.path.write_text(good * KEPT_RUNS, "utf-8")
+        history.add(SMALL)
+        assert len(history.read()) == KEPT_RUNS and history.read()[-1] == SMALL
+    history.path.unlink()
+    history.path.mkdir()
+    history.add(SMALL)  # it cannot be kept, which is no fault of the run
+    assert history.read() == []
+
+
+def test_the_time_to_the_end_is_drawn_and_the_stages_are_kept() -> None:
+    console = Console(file=io.StringIO(), force_terminal=True, width=160, color_system=None)
+    with drawn_progress(console) as progress:
+        progress.countdown.expected = {"targets": 100.0, "report": 3600.0}
+        progress.stage("targets", 10)
+        progress._bar.refresh()
+        assert "1:01:40 to the end" in console.file.getvalue()  # type: ignore[attr-defined]
+        progress.stage("report")
+        assert progress.finished().keys() == {"targets", "report"}
+        assert progress.finished().keys() == {"targets", "report"}
+
+
+def test_a_run_is_kept_once_measured_anew(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    from sfm.cli.survey_runs import RunOptions, run_survey_file
+
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path / "cache"))
+    path = write_photograph_survey(tmp_path / "survey", "kept")
+    survey = read_survey(path)
+    work = work_of(survey, find_photographs(survey))
+    assert work.sources == ("targets",) and work.photographs > 3 and work.megapixels > 0
+    assert work_of(survey, NO_PHOTOGRAPHS) == Work(("targets",), 0)
+    for _ in range(2):
+        run_survey_file(path, RunOptions(overwrite=True))
+        (run,) = RunHistory.of_user().read()  # the second read what the first measured
+        assert run.work == work and {"targets", "adjustment", "report"} <= run.seconds.keys()
+    assert json.loads(RunHistory.of_user().path.read_text("utf-8"))["photographs"] == work.photographs
