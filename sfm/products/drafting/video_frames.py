@@ -13,7 +13,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import cv2
@@ -22,9 +22,11 @@ from PIL import ExifTags, Image
 
 from sfm.files.plain_text import as_plain
 from sfm.model.conventions import AnyArray, FloatArray, IntArray
+from sfm.model.display import counted
 from sfm.model.errors import PhotographError
 from sfm.photographs.video_files import Video, opened_video
 from sfm.products.drafting.camera_groups import FOCAL_PER_SIDE
+from sfm.products.drafting.video_clocks import ClockDifference, clock_difference
 from sfm.runtime.progress import SILENT, Progress
 
 # Directions that differ by more are not matched well by any detector (Moreels and Perona 2007, IJCV 73). A
@@ -38,6 +40,7 @@ TRACKED_SIDE_PX = 640  # longer side of the pictures in which points are tracked
 POINTS, MIN_POINTS = 300, 8
 LARGER = 0.75  # quantile of motion: an object that turns before its background has a quarter of the points
 BACK_PX = 0.5  # largest distance of a point that is tracked there and back
+SAME_PLACE_RAD = math.radians(0.01)  # 0.1 px of full HD, as well as targets in videos are measured
 QUALITY = 98  # of the JPEG files: their noise is below that of the video
 
 
@@ -48,7 +51,13 @@ class Way:
     times_s: FloatArray  # of the frames, (k,)
     way_rad: FloatArray  # from the first frame to each, never less than before, (k,)
     sharpness: FloatArray  # comparable between frames of one scene, (k,)
+    speed: FloatArray  # of the apparent motion, rad/s, NaN where it is not known, (k,)
     followed: bool = True  # whether any points could be followed
+
+    @property
+    def motion(self) -> tuple[FloatArray, FloatArray]:
+        """Times of the frames, s, and the speed of the apparent motion."""
+        return self.times_s, self.speed
 
 
 class _Tracker:
@@ -62,6 +71,7 @@ class _Tracker:
         self._now = self._start
         self._chosen = 0
         self._lost: AnyArray | None = None  # last picture in which the points were lost
+        self.moved = math.nan  # median motion of the points since the last picture, rad; NaN if not known
 
     @property
     def way(self) -> float:
@@ -75,11 +85,14 @@ class _Tracker:
 
     def add(self, picture: AnyArray) -> None:
         """Follow the points into the next picture, (H, W), uint8."""
+        self.moved = math.nan
         if self._picture is None:
             self._choose(picture)
             return
         moved, kept = _tracked(self._picture, picture, self._now)
         if 2 * kept.sum() >= self._chosen and kept.sum() >= MIN_POINTS:
+            shift = np.median(np.linalg.norm((moved - self._now)[kept], axis=1))
+            self.moved = float(shift) / (FOCAL_PER_SIDE * max(picture.shape))
             self._start, self._now = self._start[kept], moved[kept]
             self._picture, self._lost = picture, None
             self._since = max(self._since, _angle(self._start, self._now, max(picture.shape)))
@@ -117,7 +130,7 @@ def follow_camera(video: Video, progress: Progress = SILENT) -> Way:
     Raises:
         PhotographError: no frame can be decoded.
     """
-    tracker, way, sharpness = _Tracker(), list[float](), list[float]()
+    tracker, way, sharpness, moved = _Tracker(), list[float](), list[float](), list[float]()
 
     def power(picture: AnyArray) -> float:
         """Return the power of gradients from pixel to pixel."""
@@ -132,10 +145,13 @@ def follow_camera(video: Video, progress: Progress = SILENT) -> Way:
         small = np.asarray(cv2.resize(grey, size, interpolation=cv2.INTER_AREA))
         tracker.add(small)
         way.append(tracker.way)
+        moved.append(tracker.moved)
         coarse = cv2.resize(grey, None, fx=0.25, fy=0.25, interpolation=cv2.INTER_AREA)
         sharpness.append(power(grey) / max(power(np.asarray(coarse)), 1e-6))
         progress.advance(f"{frame.time_s:.1f} s")
-    return Way(np.array(video.times_s), np.array(way), np.array(sharpness), tracker.has_points)
+    times = np.array(video.times_s)
+    speed = np.array(moved) / np.maximum(np.diff(times, prepend=times[0]), 1e-3)
+    return Way(times, np.array(way), np.array(sharpness), speed, tracker.has_points)
 
 
 def choose_frames(way: Way, count: int | None = None) -> IntArray:
@@ -182,22 +198,103 @@ def _frame_near(place: float, spacing: float, way: Way) -> tuple[int, bool]:
     return (min(sharp, key=lambda k: away[k]), True) if sharp else (best, False)
 
 
-def write_frames(video: Video, chosen: IntArray, folder: Path, name: str) -> tuple[str, ...]:
+@dataclass(frozen=True)
+class ChosenFrames:
+    """The frames of a video to use."""
+
+    frames: IntArray  # in order, (n,)
+    moments_s: FloatArray  # times by which they are named, those of frames of other videos too, (n,)
+    reference: int | None = None  # number of the video that this one moves together with
+    ahead_s: float = 0.0  # of its clock
+    shared: int = 0  # frames of one moment with those of that video
+
+
+def choose_of_all(ways: Sequence[Way], count: int | None = None) -> tuple[ChosenFrames, ...]:
+    """Return the frames of videos to use, near one another in time where cameras move together.
+
+    Frames are of one moment where the cameras hardly moved between them.
+
+    Args:
+        ways: those of the cameras.
+        count: see `choose_frames`.
+    """
+    chosen = dict[int, ChosenFrames]()
+    for first, way in enumerate(ways):
+        if first in chosen:
+            continue
+        mounted = {
+            k: clock
+            for k, other in enumerate(ways[first + 1 :], first + 1)
+            if k not in chosen and (clock := clock_difference(way.motion, other.motion)) is not None
+        }
+        joint = _joint_way(way, [(ways[k], clock) for k, clock in mounted.items()]) if mounted else way
+        frames = choose_frames(joint, count)
+        at = way.times_s[frames]
+        chosen[first] = ChosenFrames(frames, at)
+        for k, clock in mounted.items():
+            nearest, moved = _nearest(ways[k], at, clock)
+            filmed = np.isfinite(moved)  # else the video begins later, or has ended
+            nearest, places = np.unique(nearest[filmed], return_index=True)
+            shared = moved[filmed][places] <= SAME_PLACE_RAD
+            own = ways[k].times_s[nearest] - clock.ahead_s
+            chosen[k] = ChosenFrames(
+                nearest, np.where(shared, at[filmed][places], own), first, clock.ahead_s, int(shared.sum())
+            )
+    return tuple(chosen[k] for k in range(len(ways)))
+
+
+def _nearest(way: Way, at: FloatArray, clock: ClockDifference) -> tuple[IntArray, FloatArray]:
+    """Return the frames nearest to moments, and how far the camera may have moved between, rad, (n,).
+
+    It is infinite where no frame is near.
+
+    Args:
+        way: that of the camera.
+        at: times of the moments by the clock of the reference, s, (n,).
+        clock: of the camera.
+    """
+    nearest = np.abs(way.times_s - (at + clock.ahead_s)[:, None]).argmin(axis=1)
+    apart = np.abs(way.times_s[nearest] - at - clock.ahead_s)
+    moved = np.nan_to_num(way.speed[nearest], nan=np.inf) * np.hypot(apart, clock.sigma_s)
+    return nearest, np.where(apart <= np.median(np.diff(way.times_s)), moved, np.inf)
+
+
+def _joint_way(reference: Way, others: Sequence[tuple[Way, ClockDifference]]) -> Way:
+    """Return the way that the fastest of cameras goes, and how sharp the least sharp frame of a moment is.
+
+    A moment at which a camera moves between its frame and that of the reference counts as less sharp.
+
+    others: ways of the other cameras, and their clocks.
+    """
+    ways, sharpness = [reference.way_rad], [reference.sharpness / np.median(reference.sharpness)]
+    for other, clock in others:
+        at = reference.times_s + clock.ahead_s
+        ways.append(np.interp(at, other.times_s, other.way_rad))
+        nearest, moved = _nearest(other, reference.times_s, clock)
+        relative = other.sharpness[nearest] / np.median(other.sharpness)
+        sharpness.append(relative / (1 + np.where(np.isfinite(moved), moved, 0.0) / SAME_PLACE_RAD))
+    gone = np.diff(ways, axis=1, prepend=0.0).max(axis=0)
+    gone[0] = 0.0
+    return replace(reference, way_rad=np.cumsum(gone), sharpness=np.min(sharpness, axis=0))
+
+
+def write_frames(video: Video, chosen: ChosenFrames, folder: Path, name: str) -> tuple[str, ...]:
     """Write frames as JPEG files whose EXIF data state one camera; return their names.
 
     Args:
         video: an open video.
-        chosen: indices of the frames.
+        chosen: the frames.
         folder: where they are written.
         name: begins their names, and tells the cameras of several videos apart.
 
     Raises:
         PhotographError: a frame cannot be decoded any more.
     """
-    wanted, names = set(chosen.tolist()), list[str]()
+    wanted = dict(zip(chosen.frames.tolist(), chosen.moments_s.tolist(), strict=True))
+    names = list[str]()
     for frame in video.frames():
         if frame.index in wanted:
-            names.append(f"{name}-{round(1000 * frame.time_s):07d}ms.jpg")
+            names.append(f"{name}-{round(1000 * wanted[frame.index]):07d}ms.jpg")
             exif = Image.Exif()
             exif[ExifTags.Base.Model] = _plain(f"{video.model or ''} {name}".strip())
             if video.make:
@@ -264,6 +361,8 @@ def extract_frames(
 ) -> tuple[WrittenFrames, ...]:
     """Write sharp frames of videos, spaced by the motion of the camera, as photographs.
 
+    Frames of videos that move together are of the same moments, by which they are named.
+
     Args:
         videos: files; each is a camera.
         folder: an empty folder.
@@ -273,15 +372,25 @@ def extract_frames(
     Raises:
         PhotographError: a video cannot be read.
     """
-    written = []
+    ways, remarks = list[Way](), list[list[str]]()
     for path in videos:
         with opened_video(path) as video:
             progress.stage("frames", video.stream.frames or None)
-            way = follow_camera(video, progress)
-            chosen = choose_frames(way, count)
-            said = list(video.remarks())
-            alike = [other for other in videos if other.stem.casefold() == path.stem.casefold()]
-            name = as_plain(path.stem if len(alike) < 2 else path.name.replace(".", "-"))
+            ways.append(follow_camera(video, progress))
+            remarks.append(list(video.remarks()))
+    written = []
+    for path, way, chosen, said in zip(videos, ways, choose_of_all(ways, count), remarks, strict=True):
+        if chosen.reference is not None:
+            name = as_plain(videos[chosen.reference].name)
+            later = f"{abs(chosen.ahead_s):.2f} s {'later' if chosen.ahead_s < 0 else 'earlier'}"
+            still = "" if chosen.shared else "; stop at each place to let frames of both be of one moment"
+            said.append(
+                f"moves together with {name} and begins {later}: {counted(chosen.shared, 'frame')} of "
+                f"{len(chosen.frames)} of one moment, where the cameras stand still, and named so{still}"
+            )
+        alike = [other for other in videos if other.stem.casefold() == path.stem.casefold()]
+        name = as_plain(path.stem if len(alike) < 2 else path.name.replace(".", "-"))
+        with opened_video(path) as video:
             names = write_frames(video, chosen, folder, name)
         if len(names) == 1 < len(way.times_s):
             why = "the camera does not move" if way.followed else "its pictures show nothing to follow"

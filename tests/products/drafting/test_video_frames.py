@@ -84,7 +84,7 @@ def test_blurred_frames_of_a_fast_camera_are_passed_over(seed: int) -> None:
     rng = np.random.default_rng(seed)
     blurred = rng.uniform(size=200) < 0.4
     sharpness = np.where(blurred, 0.13, 0.19) + rng.normal(0, 0.005, 200)
-    way = Way(np.arange(200) / 10, np.cumsum(rng.uniform(0.05, 0.09, 200)), sharpness)
+    way = Way(np.arange(200) / 10, np.cumsum(rng.uniform(0.05, 0.09, 200)), sharpness, np.ones(200))
     chosen = choose_frames(way)
     assert blurred[chosen].mean() < 0.2 < 0.3 < blurred.mean()
     assert np.diff(way.way_rad[chosen]).max() < MATCHED_RAD * 1.1

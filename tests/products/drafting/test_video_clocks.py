@@ -1,0 +1,107 @@
+"""Videos of cameras that move together: the difference of their clocks, and frames of one moment."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from sfm.model.conventions import FloatArray
+from sfm.products.drafting.video_clocks import clock_difference
+from sfm.products.drafting.video_frames import SAME_PLACE_RAD, Way, choose_of_all, extract_frames
+from tests.synthetic import seed_of
+from tests.videos import orbit, write_video
+
+AHEAD_S = -1.37
+
+
+def speeds(rng: np.random.Generator, length_s: float) -> tuple[FloatArray, FloatArray]:
+    """Return the speed of a hand: moves of different length and speed, with rests between them."""
+    fine = np.arange(0, length_s, 0.01)
+    speed, at = np.zeros(len(fine)), float(rng.uniform(0.3, 1.5))
+    while at < length_s:
+        last = at + rng.uniform(0.4, 2.5)
+        speed[(fine >= at) & (fine < last)] = rng.uniform(0.1, 0.8)
+        at = last + rng.uniform(0.2, 1.5)
+    return fine, np.convolve(speed, np.ones(25) / 25, "same")
+
+
+def seen(
+    motion: tuple[FloatArray, FloatArray], times: FloatArray, ahead_s: float, rng: np.random.Generator
+) -> tuple[FloatArray, FloatArray]:
+    """Return the apparent motion of a camera: another scale, and noise, at frames of its own clock."""
+    shown = rng.uniform(0.5, 2.0) * np.interp(times - ahead_s, *motion)
+    return times, np.abs(shown * rng.uniform(0.7, 1.3, len(times)) + 0.02 * rng.standard_normal(len(times)))
+
+
+@pytest.mark.parametrize("rates", [(25, 25), (12, 15), (30, 24)])
+def test_the_difference_of_clocks_is_found_to_a_part_of_a_frame(rates: tuple[int, int]) -> None:
+    errors = []
+    for number in range(20):
+        rng = seed_of(f"rig of videos {number}")
+        motion = speeds(rng, 25.0)
+        a = seen(motion, np.arange(0, 18, 1 / rates[0]), 0.0, rng)
+        b = seen(motion, np.arange(0, 17, 1 / rates[1]), AHEAD_S, rng)
+        clock = clock_difference(a, b)
+        assert clock is not None and clock.correlation > 0.7
+        errors.append((clock.ahead_s - AHEAD_S) / clock.sigma_s)
+        back = clock_difference(b, a)
+        assert back is not None and back.ahead_s == pytest.approx(-clock.ahead_s, abs=clock.sigma_s)
+    assert np.sqrt(np.square(errors).mean()) < 2
+
+
+def test_cameras_that_are_carried_one_by_one_have_none() -> None:
+    found = 0
+    for number in range(100):
+        rng = seed_of(f"videos of two persons {number}")
+        a, b = (seen(speeds(rng, 30.0), np.arange(0, 20, 1 / 15), 0.0, rng) for _ in range(2))
+        found += clock_difference(a, b) is not None
+    assert found <= 1
+    rng = seed_of("even")
+    even = np.arange(0, 10, 0.04), 0.3 + 0.01 * rng.standard_normal(250)
+    assert clock_difference(even, (even[0], 0.3 + 0.01 * rng.standard_normal(250))) is None
+    still = np.arange(0, 10, 0.04), np.zeros(250)
+    assert clock_difference(still, even) is None and clock_difference(still, still) is None
+    short = np.arange(3) / 25, np.array([np.nan, 0.1, 0.3])
+    assert clock_difference(short, even) is None
+
+
+def way_of(motion: tuple[FloatArray, FloatArray], times: FloatArray, ahead_s: float) -> Way:
+    speed = np.interp(times - ahead_s, *motion)
+    return Way(times, np.cumsum(speed) * (times[1] - times[0]), 1 / (1 + speed), speed)
+
+
+def test_frames_are_of_one_moment_where_the_cameras_stand_still() -> None:
+    places = np.arange(0, 40, 0.01)
+    speed = np.where(places % 2.0 < 0.4, 0.5, 0.0)  # a fifth of a radian, then a rest
+    motion = places, np.convolve(speed, np.ones(9) / 9, "same")
+    alone = way_of(motion, np.arange(0, 30, 1 / 25), 0.0)
+    other = way_of(motion, np.arange(0, 25, 1 / 30), AHEAD_S)
+    first, second = choose_of_all([alone, other])
+    assert first.reference is None and second.reference == 0
+    assert second.ahead_s == pytest.approx(AHEAD_S, abs=0.01)
+    shared = np.isin(second.moments_s, first.moments_s)
+    assert shared.sum() == second.shared > 0.8 * len(second.frames) > 8
+    moving = np.interp(second.moments_s, *motion)
+    assert moving[shared].max() * 0.004 < SAME_PLACE_RAD
+    at = other.times_s[second.frames] - second.ahead_s
+    assert np.abs(at - second.moments_s).max() < 1 / 25
+    assert len(choose_of_all([alone, other], 7)[0].frames) == 7
+    lone = choose_of_all([alone])[0]
+    assert lone.reference is None and np.array_equal(lone.moments_s, alone.times_s[lone.frames])
+
+
+def test_videos_of_a_rig_have_frames_of_the_same_names(tmp_path: Path) -> None:
+    at = np.arange(0, 16, 1 / 12)
+    turns = 0.22 * np.floor(at / 2) + 0.22 * np.clip((at % 2) / 0.5, 0, 1)
+    left = write_video(tmp_path / "left.mp4", orbit(turns, seed="left"), rate=12)
+    right = write_video(tmp_path / "right.mp4", orbit(turns[14:] + 0.4, seed="right"), rate=12)
+    (tmp_path / "frames").mkdir()
+    first, second = extract_frames([left, right], tmp_path / "frames")
+    assert first.said == ()
+    (said,) = second.said
+    assert "moves together with left.mp4 and begins 1.1" in said and " s later: " in said
+    moments = [{name.split("-")[1] for name in written.names} for written in (first, second)]
+    assert len(moments[0] & moments[1]) >= 5
+    assert f"{len(moments[0] & moments[1])} frames of {len(second.names)} of one moment" in said
