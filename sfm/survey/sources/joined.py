@@ -45,7 +45,7 @@ from sfm.survey.sources.source import Correspondences, SurveySource
 
 SAME_PX = 0.1  # by which two measurements of one target differ, whatever their stated precision
 REFUSED_PX = 1.0  # by which a target that a person refused may be elsewhere in a later run
-RAYS_OF_SOURCE = 5_000  # about so many rays of a source give its weight to one percent
+RAYS_OF_SOURCE = 2_000  # about so many rays of a source give its weight to two percent
 MIN_SAME = 2  # photographs in which a point without a name is where another is
 
 
