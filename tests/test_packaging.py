@@ -82,7 +82,7 @@ def test_the_package_brings_colmap_and_no_library_of_an_extra() -> None:
     core = " ".join(PROJECT["dependencies"])
     assert "pycolmap>=4.2,<4.3" in PROJECT["dependencies"]
     extra = r"dask|distributed|cryptography|starlette|uvicorn|heif|rawpy|\bav\b|pytest|mypy"
-    extra += "|pyproj|laspy|lazrs|pye57"
+    extra += "|pyproj|laspy|lazrs|pye57|trimesh|lxml|networkx"
     assert not re.search(extra, core)
 
 

@@ -1,26 +1,29 @@
-r"""Points, lines and circles as DXF for CAD programs, with names as text and a layer for each group.
+"""Points, lines and circles as DXF (R2018) for CAD programs, by ezdxf, with a layer for each group.
 
-The files use the text form of release 12, which every program reads.
-
-Source: Autodesk, DXF Reference (release 12), group codes of POINT, LINE, CIRCLE and TEXT; characters beyond
-ASCII as \U+XXXX; arbitrary axis algorithm.
+Source: Autodesk, DXF Reference (2018); ezdxf 1.4 documentation.
 """
 
 from __future__ import annotations
 
+import configparser
 import re
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
-from adapters.reading.text_lines import write_lines
+from sfm.files.whole_files import whole_file
 from sfm.model.conventions import FloatArray
+from sfm.model.errors import OutputError
 
-LAYER_CHARACTERS = 31  # maximum length of a name in release 12
+LAYER_CHARACTERS = 255  # maximum length of a name
 TEXT_HEIGHT = 0.01  # of the size of the drawing
 COLOURS = 7  # of AutoCAD's index, used in turn
+POINT_STYLE = 3  # $PDMODE: a diagonal cross
+INSUNITS = {"in": 1, "ft": 2, "mm": 4, "cm": 5, "m": 6, "km": 7, "nm": 12, "um": 13, "µm": 13, "dm": 14}
+UNITLESS = 0
 
 
 @dataclass(frozen=True)
@@ -48,6 +51,7 @@ def write_dxf(
     xyz: FloatArray,
     layers: Sequence[str],
     *,
+    unit: str = "",
     lines: Sequence[DxfLine] = (),
     circles: Sequence[DxfCircle] = (),
     texts: Sequence[tuple[str, str, FloatArray]] = (),
@@ -57,8 +61,9 @@ def write_dxf(
     Args:
         path: path of the file.
         names: names of the points.
-        xyz: coordinates of the points, (n, 3).
+        xyz: coordinates of the points, object unit, (n, 3).
         layers: layer of each point.
+        unit: name of the object unit; a unit that DXF does not know makes a drawing without unit.
         lines: lines to draw.
         circles: circles to draw.
         texts: layer, text and position of further texts.
@@ -66,54 +71,58 @@ def write_dxf(
     Raises:
         OutputError: the file cannot be written.
     """
-    centres = [circle.centre[None] for circle in circles]
-    places = np.vstack([xyz, *centres, *(line.start[None] for line in lines)])
+    ezdxf = _load_ezdxf()
+    drawing = ezdxf.new("R2018", units=INSUNITS.get(unit, UNITLESS))
+    space = drawing.modelspace()
+    ends = [end for line in lines for end in (line.start, line.end)]
+    places = np.vstack([xyz, *ends, *(circle.centre for circle in circles)])
     size = float(np.linalg.norm(np.ptp(places, axis=0))) if len(places) > 1 else 1.0
     height = TEXT_HEIGHT * (size or 1.0)
-    drawn = [line.layer for line in lines] + [circle.layer for circle in circles]
-    drawn += [layer for layer, _, _ in texts]
-    used = dict.fromkeys(_layer(name) for name in ("0", *layers, *drawn))
-    out: list[str] = []
+    if len(places):
+        low, high = places.min(axis=0).tolist(), places.max(axis=0).tolist()
+        space.reset_extents(low, high)
+        drawing.header["$EXTMIN"], drawing.header["$EXTMAX"] = low, high
+    drawing.header["$PDMODE"], drawing.header["$PDSIZE"] = POINT_STYLE, height / 2
 
-    def put(*pairs: tuple[int, object]) -> None:
-        for code, value in pairs:
-            out.extend((f"{code:3d}", f"{value:.12g}" if isinstance(value, float) else str(value)))
+    def on(layer: str) -> dict[str, Any]:
+        name = re.sub(r"[\x00-\x1f<>/\\\":;?*=|`',]", "_", layer)[:LAYER_CHARACTERS] or "0"
+        if name not in drawing.layers:
+            drawing.layers.add(name, color=7 - len(drawing.layers) % COLOURS)
+        return {"layer": name}
 
-    def place(first: int, at: FloatArray) -> tuple[tuple[int, object], ...]:
-        return tuple((first + 10 * k, float(at[k])) for k in range(3))
+    def add_text(text: str, layer: str, at: FloatArray, height: float) -> None:
+        line = "".join(c if c.isprintable() else " " for c in text)
+        space.add_text(line, height=height, dxfattribs=on(layer) | {"insert": at.tolist()})
 
-    low, high = (places.min(axis=0), places.max(axis=0)) if len(places) else (np.zeros(3), np.ones(3))
-    put((0, "SECTION"), (2, "HEADER"), (9, "$ACADVER"), (1, "AC1009"))
-    put((9, "$EXTMIN"), *place(10, low), (9, "$EXTMAX"), *place(10, high))
-    put((9, "$PDMODE"), (70, 3), (9, "$PDSIZE"), (40, height / 2), (0, "ENDSEC"))
-    put((0, "SECTION"), (2, "TABLES"), (0, "TABLE"), (2, "LAYER"), (70, len(used)))
-    for k, name in enumerate(used):
-        put((0, "LAYER"), (2, name), (70, 0), (62, 7 - k % COLOURS), (6, "CONTINUOUS"))
-    put((0, "ENDTAB"), (0, "ENDSEC"), (0, "SECTION"), (2, "ENTITIES"))
     for name, at, layer in zip(names, xyz, layers, strict=True):
-        put((0, "POINT"), (8, _layer(layer)), *place(10, at))
-        put((0, "TEXT"), (8, _layer(layer)), *place(10, at + 0.6 * height), (40, height), (1, _text(name)))
+        space.add_point(at.tolist(), dxfattribs=on(layer))
+        add_text(name, layer, at + 0.6 * height, height)
     for line in lines:
-        put((0, "LINE"), (8, _layer(line.layer)), *place(10, line.start), *place(11, line.end))
+        space.add_line(line.start.tolist(), line.end.tolist(), dxfattribs=on(line.layer))
     for circle in circles:
-        n = circle.normal / np.linalg.norm(circle.normal)
-        # in the axes of the entity, by the arbitrary axis algorithm
-        x = np.cross([0.0, 1.0, 0.0] if np.abs(n[:2]).max() < 1 / 64 else [0.0, 0.0, 1.0], n)
-        x /= np.linalg.norm(x)
-        centre = np.stack([x, np.cross(n, x), n], axis=1).T @ circle.centre
-        put((0, "CIRCLE"), (8, _layer(circle.layer)), *place(10, centre), (40, float(circle.radius)))
-        put(*place(210, n))
+        own = ezdxf.math.OCS(circle.normal.tolist())  # axes of the entity, by the arbitrary axis algorithm
+        centre = own.from_wcs(circle.centre.tolist())
+        extrusion = {"extrusion": own.uz}
+        space.add_circle(centre, circle.radius, dxfattribs=on(circle.layer) | extrusion)
     for layer, text, at in texts:
-        put((0, "TEXT"), (8, _layer(layer)), *place(10, at), (40, 1.5 * height), (1, _text(text)))
-    put((0, "ENDSEC"), (0, "EOF"))
-    write_lines(path, out)
+        add_text(text, layer, at, 1.5 * height)
+    with whole_file(path) as part, part.open("w", encoding=drawing.output_encoding, newline="\n") as file:
+        drawing.write(file)
 
 
-def _layer(name: str) -> str:
-    """Return a name in the form that release 12 allows for layers."""
-    return re.sub(r"[^A-Za-z0-9$_-]", "_", name)[:LAYER_CHARACTERS] or "0"
+def _load_ezdxf() -> Any:
+    """Return ezdxf with its own defaults: it reads ezdxf.ini of the current folder, which may be foreign.
 
-
-def _text(text: str) -> str:
-    """Return a text with non-ASCII characters as escapes."""
-    return "".join(c if 32 <= ord(c) < 127 else f"\\U+{ord(c):04X}" for c in text)
+    Raises:
+        OutputError: such a file is damaged.
+    """
+    try:
+        import ezdxf
+        import ezdxf.math
+        from ezdxf._options import options  # typed there
+    except (configparser.Error, SystemExit) as error:
+        reason = " ".join(str(error).split())[:100]
+        raise OutputError(f"ezdxf.ini: ezdxf cannot read its settings ({reason}); rename the file") from error
+    options.reset()  # type: ignore[no-untyped-call]
+    options.write_fixed_meta_data_for_testing = True  # equal drawings are equal files
+    return ezdxf

@@ -1,69 +1,74 @@
-"""Triangle meshes in STL and PLY (binary and text), read as untrusted files.
+"""Triangle meshes in STL, PLY, OBJ and 3MF, read as untrusted files by trimesh of kolinear[exchange].
 
-Polygons in PLY are split into triangles from their first corner. The size stated in a file is checked against
-its actual size before memory is allocated.
+Polygons are split into triangles. What a file states is checked before trimesh takes memory for it, and its
+numbers afterwards.
 
 Source: 3D Systems (1989), StereoLithography Interface Specification; Turk (1994), The PLY polygon file
-format.
+format; Wavefront (1995), Object Files (.obj); 3MF Consortium (2018), 3D Manufacturing Format 1.2.
 """
 
 from __future__ import annotations
 
+import re
+import zipfile
+from collections import Counter
+from io import BytesIO
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
-from adapters.reading.text_lines import Lines
+from adapters.formats.clouds import reading
 from sfm.files.csv_tables import MAX_NUMBER
-from sfm.files.plain_text import shorten
 from sfm.model.conventions import FloatArray, IntArray
-from sfm.model.errors import SurveyFileError
+from sfm.model.errors import SurveyFileError, missing_library
 
 MAX_BYTES = 1_000_000_000
 STL_HEADER, STL_RECORD = 84, 50  # bytes
-MAX_CORNERS = 255  # of a polygon
-MAX_PROPERTIES = 100
+MAX_BODIES, MAX_NESTING = 10_000, 20  # of a 3MF file, with all copies
 MAX_HEADER = 100_000  # bytes of a PLY header
-TYPES = {
-    "char": "i1", "int8": "i1", "uchar": "u1", "uint8": "u1", "short": "i2", "int16": "i2", "ushort": "u2",
-    "uint16": "u2", "int": "i4", "int32": "i4", "uint": "u4", "uint32": "u4", "float": "f4", "float32": "f4",
-    "double": "f8", "float64": "f8",
-}  # fmt: skip
+ENDINGS = (".stl", ".ply", ".obj", ".3mf")
 
 
 def read_mesh(path: Path) -> tuple[FloatArray, IntArray]:
-    """Read the triangles of an STL or PLY file.
+    """Read the triangles of a mesh; several bodies of a file become one mesh.
 
     Returns:
-        Vertices (v, 3) and the indices of the vertices of each triangle (t, 3).
+        Vertices (v, 3), in the unit of the file, and the indices of the vertices of each triangle (t, 3).
 
     Raises:
         SurveyFileError: the file is not a valid mesh.
+        MissingLibraryError: trimesh is not installed, or for 3MF lxml or networkx.
     """
-    try:
-        if not path.is_file():
-            raise SurveyFileError(f"{path}: not a file, a mesh (.stl or .ply) is needed")
+    ending = path.suffix.lower()
+    if not path.is_file():
+        raise SurveyFileError(f"{path}: not a file, a mesh ({', '.join(ENDINGS)}) is needed")
+    if ending not in ENDINGS:
+        raise SurveyFileError(f"{path}: unknown ending {path.suffix!r:.40}, a mesh is {' or '.join(ENDINGS)}")
+    trimesh = _load_trimesh(ending)
+    with reading(path, ending[1:].upper()):
         size = path.stat().st_size
         if size > MAX_BYTES:
             raise SurveyFileError(f"{path}: {size} bytes, at most {MAX_BYTES} are read")
-        with path.open("rb") as file:
-            first = file.read(STL_HEADER)
-        if path.suffix.lower() == ".ply":
-            vertices, triangles = _read_ply(path, path.read_bytes())
-        elif path.suffix.lower() == ".stl":
-            count = int.from_bytes(first[80:84], "little")
-            binary = size == STL_HEADER + STL_RECORD * count and size > STL_HEADER
-            if binary:
-                record = np.dtype([("normal", "<f4", 3), ("corners", "<f4", (3, 3)), ("attribute", "<u2")])
-                corners = np.fromfile(path, dtype=record, offset=STL_HEADER)["corners"].astype(float)
-            else:
-                corners = _text_corners(path)
-            vertices = corners.reshape(-1, 3)  # shared by no two triangles
-            triangles = np.arange(len(vertices), dtype=np.int64).reshape(-1, 3)
-        else:
-            raise SurveyFileError(f"{path}: unknown ending {path.suffix!r:.40}, a mesh is .stl or .ply")
-    except OSError as error:
-        raise SurveyFileError(f"{path}: cannot be read: {error.strerror or error}") from error
+        data = path.read_bytes()
+        stated = (0, 0)
+        if ending == ".ply":
+            stated = _stated_by_ply(path, data)
+        elif ending == ".3mf":
+            _refuse_bomb(path, data)
+        elif ending == ".obj" or not _is_binary_stl(path, data):  # texts, of which names may be Latin-1
+            data = data.decode("utf-8", errors="replace").encode()
+        with np.errstate(invalid="ignore"):
+            mesh = trimesh.load_mesh(BytesIO(data), file_type=ending[1:], process=False, skip_materials=True)
+            if isinstance(mesh, trimesh.Scene):
+                mesh = mesh.to_mesh()
+        vertices = np.array(mesh.vertices, dtype=float).reshape(-1, 3)
+        triangles = np.array(mesh.faces, dtype=np.int64).reshape(-1, 3)
+    if len(vertices) < stated[0] or len(triangles) < stated[1]:
+        raise SurveyFileError(
+            f"{path}: {len(vertices)} vertices and {len(triangles)} triangles, its header announces "
+            f"{stated[0]} and {stated[1]}"
+        )
     if not len(triangles):
         raise SurveyFileError(f"{path}: no triangles, at least one is needed")
     if not (np.abs(vertices) <= MAX_NUMBER).all():
@@ -75,133 +80,97 @@ def read_mesh(path: Path) -> tuple[FloatArray, IntArray]:
     return vertices, triangles
 
 
-def _text_corners(path: Path) -> FloatArray:
-    """Return the corners of the triangles of a text STL file, (t, 3, 3)."""
-    text = Lines.of(path)
-    first = (text.maybe_line() or "").split()
-    if first[:1] != ["solid"]:
-        text.number = 1
-        raise text.error(
-            "neither a binary STL file of the size that it states, nor a text that begins with 'solid'"
+def _load_trimesh(ending: str) -> Any:
+    """Return trimesh, with the libraries that it needs for a kind of file.
+
+    Raises:
+        MissingLibraryError: one of them is not installed.
+    """
+    try:
+        import trimesh
+
+        if ending == ".3mf":
+            import lxml.etree  # noqa: F401  both are used by trimesh
+            import networkx  # noqa: F401
+    except ImportError as error:
+        libraries = ("trimesh", "lxml", "networkx") if ending == ".3mf" else ("trimesh",)
+        raise missing_library(f"mesh {ending}", libraries, "exchange") from error
+    return trimesh
+
+
+def _is_binary_stl(path: Path, data: bytes) -> bool:
+    """Return whether an STL file is binary, by the size that it states.
+
+    Raises:
+        SurveyFileError: it is neither binary nor text.
+    """
+    if len(data) > STL_HEADER and (
+        len(data) == STL_HEADER + STL_RECORD * int.from_bytes(data[STL_HEADER - 4 : STL_HEADER], "little")
+    ):
+        return True
+    if not data.lstrip().startswith(b"solid"):
+        raise SurveyFileError(
+            f"{path}: neither a binary STL file of the size that it states, nor a text that begins with "
+            "'solid'"
         )
-    corners: list[float] = []
-    while (line := text.maybe_line()) is not None:
-        words = line.split()
-        if words[:1] == ["vertex"]:
-            if len(words) != 4:
-                raise text.error(f"'{shorten(line)}', needed 'vertex X Y Z'")
-            corners += [text.number_of(word) for word in words[1:]]
-    if len(corners) % 9:
-        raise text.error(f"{len(corners) // 3} vertices, each triangle needs three")
-    return np.array(corners).reshape(-1, 3, 3)
+    return False
 
 
-def _read_ply(path: Path, data: bytes) -> tuple[FloatArray, IntArray]:
+def _stated_by_ply(path: Path, data: bytes) -> tuple[int, int]:
+    """Return the numbers of vertices and faces in the header of a PLY file.
+
+    Raises:
+        SurveyFileError: there is no header, or it announces more elements than the file has bytes.
+    """
     end = data.find(b"end_header", 0, MAX_HEADER)
-    after = data.find(b"\n", end)
-    if not data.startswith(b"ply") or end < 0 or after < 0:
+    if not data.startswith(b"ply") or end < 0:
         raise SurveyFileError(f"{path}, line 1: not a PLY file, needed 'ply' and a header")
-    lines = data[:end].decode("ascii", errors="replace").splitlines()
-    form = ""
-    elements: list[tuple[str, int, list[tuple[str, ...]]]] = []
-    for number, line in enumerate(lines, 1):
-        words = line.split()
-        where = f"{path}, line {number}: '{shorten(line)}'"
-        if words[:1] == ["format"] and len(words) > 1:
-            form = words[1]
-        elif words[:1] == ["element"]:
-            if len(words) != 3 or not words[2].isdecimal() or len(words[2]) > 10:
-                raise SurveyFileError(f"{where}, needed 'element NAME COUNT'")
-            elements.append((words[1], int(words[2]), []))
-        elif words[:1] == ["property"]:
-            known = len(words) == 3 and words[1] in TYPES
-            listed = len(words) == 5 and words[1] == "list" and {words[2], words[3]} <= TYPES.keys()
-            if not elements or not (known or listed) or len(elements[-1][2]) >= MAX_PROPERTIES:
-                raise SurveyFileError(f"{where}, needed 'property TYPE NAME' of an element")
-            elements[-1][2].append(tuple(words[1:]))
-    if form not in ("ascii", "binary_little_endian", "binary_big_endian"):
-        raise SurveyFileError(f"{path}: format {shorten(form) or 'missing'}, expected ascii or binary")
-    reader = _Values(path, data[after + 1 :], form)
-    vertices, triangles = np.empty((0, 3)), np.empty((0, 3), dtype=np.int64)
-    for name, count, properties in elements:
-        if name == "vertex":
-            vertices = reader.table(count, properties)
-        elif name == "face":
-            triangles = reader.faces(count, properties)
-            break
-        else:
-            reader.faces(count, properties, keep=False)
-    return vertices, triangles
+    stated = {name: int(count) for name, count in re.findall(rb"element (\w+) (\d{1,12})\b", data[:end])}
+    if sum(stated.values()) > len(data):
+        raise SurveyFileError(f"{path}: {sum(stated.values())} elements do not fit in {len(data)} bytes")
+    return stated.get(b"vertex", 0), stated.get(b"face", 0)
 
 
-class _Values:
-    """Reads the values of a PLY file one after another."""
+def _refuse_bomb(path: Path, data: bytes) -> None:
+    """Refuse a 3MF file that unpacks to too many bytes, or places its bodies too often.
 
-    def __init__(self, path: Path, data: bytes, form: str) -> None:
-        self.path, self.form, self.at = path, form, 0
-        self.order = ">" if form == "binary_big_endian" else "<"
-        self.words = data.split() if form == "ascii" else []
-        self.data = data
+    Raises:
+        SurveyFileError: it is such a file.
+    """
+    from lxml import etree
 
-    def table(self, count: int, properties: list[tuple[str, ...]]) -> FloatArray:
-        """Read the vertices, which have no lists, and return their coordinates.
-
-        Raises:
-            SurveyFileError: vertices without x, y and z.
-        """
-        names = [entry[-1] for entry in properties]
-        if not {"x", "y", "z"} <= set(names) or any(entry[0] == "list" for entry in properties):
-            raise SurveyFileError(f"{self.path}: the vertices lack x, y and z, or have lists")
-        if self.form == "ascii":
-            rows = self._words(count * len(names)).reshape(count, len(names))
-            return rows[:, [names.index(axis) for axis in "xyz"]]
-        record = np.dtype([(f"{k}", self.order + TYPES[entry[0]]) for k, entry in enumerate(properties)])
-        packed = np.frombuffer(self._bytes(count * record.itemsize), dtype=record)
-        return np.stack([packed[f"{names.index(axis)}"] for axis in "xyz"], axis=1).astype(float)
-
-    def faces(self, count: int, properties: list[tuple[str, ...]], keep: bool = True) -> IntArray:
-        """Read an element with lists row by row, and return the polygons of the first list as triangles.
-
-        Raises:
-            SurveyFileError: a polygon has too few or too many corners, or elements outnumber bytes.
-        """
-        triangles: list[tuple[int, int, int]] = []
-        if count * max(len(properties), 1) > len(self.data):
-            raise SurveyFileError(f"{self.path}: {count} elements do not fit in {len(self.data)} bytes")
-        for _ in range(count if properties else 0):
-            polygon: list[int] | None = None
-            for entry in properties:
-                many = 1
-                if entry[0] == "list":
-                    many = int(self._numbers(1, entry[1])[0])
-                    if not 0 <= many <= MAX_CORNERS:
-                        raise SurveyFileError(f"{self.path}: a polygon of {many} corners")
-                values = self._numbers(many, entry[2] if entry[0] == "list" else entry[0])
-                if entry[0] == "list" and polygon is None:
-                    polygon = [int(value) for value in values]
-            if keep and polygon is not None:
-                triangles += [(polygon[0], polygon[k], polygon[k + 1]) for k in range(1, len(polygon) - 1)]
-        return np.array(triangles, dtype=np.int64).reshape(-1, 3)
-
-    def _numbers(self, count: int, kind: str) -> FloatArray:
-        if self.form == "ascii":
-            return self._words(count)
-        dtype = np.dtype(self.order + TYPES[kind])
-        return np.frombuffer(self._bytes(count * dtype.itemsize), dtype=dtype).astype(float)
-
-    def _bytes(self, count: int) -> bytes:
-        part = self.data[self.at : self.at + count]
-        if len(part) < count:
-            raise SurveyFileError(f"{self.path}: ends before the last value that its header announces")
-        self.at += count
-        return part
-
-    def _words(self, count: int) -> FloatArray:
-        part = self.words[self.at : self.at + count]
-        if len(part) < count:
-            raise SurveyFileError(f"{self.path}: ends before the last value that its header announces")
-        self.at += count
-        try:
-            return np.array([float(word) for word in part])
-        except ValueError as error:
-            raise SurveyFileError(f"{self.path}: a value is not a number") from error
+    parts: dict[str, list[str]] = {}  # objects of which an object is composed
+    placed: list[str] = []
+    with zipfile.ZipFile(BytesIO(data)) as archive:
+        size = sum(entry.file_size for entry in archive.infolist())
+        if size > MAX_BYTES:
+            raise SurveyFileError(f"{path}: unpacks to {size} bytes, at most {MAX_BYTES} are read")
+        for name in archive.namelist():
+            if not name.lower().endswith(".model"):
+                continue
+            with archive.open(name) as file:
+                owner: list[str] = []
+                for event, element in etree.iterparse(
+                    file,
+                    events=("start", "end"),
+                    tag=("{*}object", "{*}component", "{*}item"),
+                    resolve_entities=False,
+                ):
+                    kind = etree.QName(element).localname
+                    if kind == "object" and event == "start":
+                        owner = parts.setdefault(element.get("id", ""), [])
+                    elif event == "start":
+                        (owner if kind == "component" else placed).append(element.get("objectid", ""))
+                    else:
+                        element.clear()
+    count = Counter(placed)
+    for _ in range(MAX_NESTING):
+        below: Counter[str] = Counter()
+        for outer, copies in count.items():
+            for inner in parts.get(outer, ()):
+                below[inner] += copies
+        count = below
+        if count.total() > MAX_BODIES:
+            raise SurveyFileError(f"{path}: places more than {MAX_BODIES} bodies, no more are read")
+    if count:
+        raise SurveyFileError(f"{path}: bodies are nested more than {MAX_NESTING} deep")

@@ -51,7 +51,7 @@ def object_of(text: str, count: int, *, open_mesh: bool) -> PlannedObject:
     Raises:
         KolinearError: the message states what was found and what was expected.
     """
-    from adapters.formats.mesh import read_mesh
+    from adapters.formats.mesh import ENDINGS, read_mesh
     from sfm.products.geometry.tolerance import Mesh
     from sfm.products.planning.planned_object import SHAPES, object_of_mesh, object_of_points, shape_object
 
@@ -59,12 +59,14 @@ def object_of(text: str, count: int, *, open_mesh: bool) -> PlannedObject:
     if colon and kind in SHAPES:
         return shape_object(kind, parse_numbers("OBJECT", sizes), count)
     path = Path(text)
-    if path.suffix.lower() in (".stl", ".ply"):
+    if path.suffix.lower() in ENDINGS:
         vertices, triangles = read_mesh(path)
         return object_of_mesh(Mesh(vertices, triangles), count, open_surface=open_mesh)
     if path.suffix.lower() != ".csv":
         shapes = ", ".join(f"{kind}:{','.join(sizes)}" for kind, sizes in SHAPES.items())
-        raise SurveyFileError(f"{text}: expected points (.csv), a mesh (.stl, .ply) or one of {shapes}")
+        raise SurveyFileError(
+            f"{text}: expected points (.csv), a mesh ({', '.join(ENDINGS)}) or one of {shapes}"
+        )
     from sfm.files.csv_tables import read_table
 
     table = read_table(

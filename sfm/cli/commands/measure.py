@@ -102,5 +102,5 @@ def _write_drawings(measurement: Measurement, folder: Path) -> None:
     write_point_covariance(measurement, folder)
     known = sigma if np.isfinite(sigma).all() else None
     write_ply(folder / "points.ply", points.xyz, names=points.names, sigma=known)
-    write_dxf(folder / "measurement.dxf", names=points.names, xyz=points.xyz, layers=layers, lines=lines,
-              circles=circles, texts=texts)  # fmt: skip
+    write_dxf(folder / "measurement.dxf", names=points.names, xyz=points.xyz, layers=layers,
+              unit=points.unit, lines=lines, circles=circles, texts=texts)  # fmt: skip

@@ -33,7 +33,7 @@ def plan_network(
         str,
         typer.Argument(
             metavar="OBJECT",
-            help="Points (.csv: id,X,Y,Z[,nX,nY,nZ]), a mesh (.stl, .ply), or box:LX,LY,LZ, "
+            help="Points (.csv: id,X,Y,Z[,nX,nY,nZ]), a mesh (.stl, .ply, .obj, .3mf), or box:LX,LY,LZ, "
             "cylinder:DIAMETER,HEIGHT, plate:LX,LY, wall:LENGTH,HEIGHT, dish:DIAMETER,DEPTH.",
         ),
     ],

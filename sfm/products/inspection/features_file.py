@@ -125,7 +125,7 @@ class ToleranceSettings(Section):
     name: Name
     shape: Name | None = None
     nominal: Name | None = None  # table id,X,Y,Z[,sX,sY,sZ]
-    mesh: Name | None = None  # .stl or .ply
+    mesh: Name | None = None  # .stl, .ply, .obj or .3mf
     points: Patterns | None = None  # points to judge; required for a mesh, else all of the shape or table
     lower: Value | None = None  # object unit; -upper if not given
     upper: Annotated[float, Field(gt=-LARGEST, le=LARGEST)]

@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from contextlib import ExitStack
 from dataclasses import dataclass, replace
+from importlib.util import find_spec
 from pathlib import Path
 from xml.sax.saxutils import escape
 
@@ -12,7 +14,7 @@ import numpy as np
 from sfm.files.open_folders import disk_errors
 from sfm.files.whole_files import whole_file
 from sfm.model.conventions import FloatArray, IntArray
-from sfm.model.errors import OutputError, SurveyFileError
+from sfm.model.errors import OutputError, SurveyFileError, missing_library
 from sfm.products.rendering.scene import (
     ARC,
     DISC,
@@ -49,6 +51,7 @@ CLEAR = 1.35
 # smallest tag or the narrowest ring of the smallest concentric tag.
 MIN_DOT_MM, MIN_MODULE_MM = 1.0, 0.25
 DEFAULT_TARGETS = 100
+FONT = "dejavusans"  # as fpdf2 keys it
 MAX_LETTERS = 40  # of the name of a code table, so that its line fits on the page
 MAX_SHEET_BYTES = 100_000_000  # for 10,000 targets
 CHECK = "print without scaling and check"  # on every page; a file with this text is an earlier sheet
@@ -318,54 +321,51 @@ def _svg(sheet: Sheet, k: int) -> str:
     return "\n".join([*lines, "</svg>", ""])
 
 
-# Mean advance of Helvetica's letters and figures over its size, to centre texts.
-HELVETICA_WIDTH = 0.5
-
-
 def _pdf(sheet: Sheet) -> bytes:
-    """Return the sheet as PDF 1.4 with one content stream per page.
+    """Return the sheet as PDF with its font.
 
-    Source: ISO 32000-1:2008, secs. 7.3.4.2 (literal strings), 7.5 (file structure), 8.5 (paths), 9.4 (text),
-    annex D.2 (WinAnsiEncoding: Windows code page 1252).
+    Lengths are given in points, which fpdf2 writes with four decimals (35 nm); in millimetres it would round
+    the scale of the page to 16 ppm.
+
+    Source: ISO 32000-1:2008, sec. 8.3.2.3 (points); fpdf2 2.8 documentation.
     """
-    width, height = sheet.size_mm
+    from fpdf import FPDF
+    from fpdf.drawing import PaintedPath
+    from fpdf.fonts import TTFFont
+
     scale = POINTS_PER_INCH / MM_PER_INCH
-    streams = []
+    width, height = (scale * side for side in sheet.size_mm)
+    pdf = FPDF(unit="pt", format=(width, height))
+    pdf.set_auto_page_break(False)
+    pdf.set_subject(CHECK)  # metadata are not compressed
+    pdf.add_font(FONT, fname=_font_file())
+    font = pdf.fonts[FONT]
+    letters = font.cmap if isinstance(font, TTFFont) else {}
     for k, page in enumerate(sheet.pages):
-        lines = [f"{scale:.10f} 0 0 {scale:.10f} 0 0 cm"]
-        for path in _outlines(sheet, page):
-            lines.append("1 g" if path.white else "0 g")
-            for letter, numbers in path.commands:
-                operator = {"M": "m", "L": "l", "C": "c"}[letter]
-                lines.append(" ".join(f"{v:.5f}" for v in numbers) + f" {operator}")
-            lines.append("h f")
-        lines.append("0 g")
+        pdf.add_page()
+        with pdf.drawing_context() as drawing:
+            for outline in _outlines(sheet, page):
+                path = PaintedPath()
+                path.style.fill_color = "#ffffff" if outline.white else "#000000"
+                path.style.stroke_color = None
+                draw: dict[str, Callable[..., PaintedPath]]
+                draw = {"M": path.move_to, "L": path.line_to, "C": path.curve_to}
+                for letter, numbers in outline.commands:
+                    xy = np.array(numbers).reshape(-1, 2) * (scale, -scale) + (0, height)
+                    draw[letter](*xy.ravel().tolist())
+                path.close()
+                drawing.add_item(path)
         for x, y, size, words in _texts(sheet, k):
-            left = x - HELVETICA_WIDTH * size * len(words) / 2
-            known = words.encode("cp1252", "replace").decode("cp1252")  # ? for other characters
-            escaped = "".join(f"\\{letter}" if letter in "\\()" else letter for letter in known)
-            lines.append(f"BT /F {size:g} Tf {left:.3f} {y:.3f} Td ({escaped}) Tj ET")
-        streams.append("\n".join(lines).encode("cp1252"))
-    n = len(streams)
-    kids = " ".join(f"{4 + 2 * k} 0 R" for k in range(n))
-    objects = [
-        b"<< /Type /Catalog /Pages 2 0 R >>",
-        f"<< /Type /Pages /Kids [{kids}] /Count {n} >>".encode(),
-        b"<< /Type /Font /Subtype /Type1 /BaseFont /Helvetica /Encoding /WinAnsiEncoding >>",
-    ]
-    for k, stream in enumerate(streams):
-        objects.append(
-            f"<< /Type /Page /Parent 2 0 R /MediaBox [0 0 {width * scale:.4f} {height * scale:.4f}] "
-            f"/Resources << /Font << /F 3 0 R >> >> /Contents {5 + 2 * k} 0 R >>".encode()
-        )
-        objects.append(b"<< /Length %d >>\nstream\n%b\nendstream" % (len(stream), stream))
-    out = bytearray(b"%PDF-1.4\n")
-    offsets = []
-    for k, body in enumerate(objects):
-        offsets.append(len(out))
-        out += b"%d 0 obj\n%b\nendobj\n" % (k + 1, body)
-    table = len(out)
-    out += b"xref\n0 %d\n0000000000 65535 f \n" % (len(objects) + 1)
-    out += b"".join(b"%010d 00000 n \n" % offset for offset in offsets)
-    out += b"trailer\n<< /Size %d /Root 1 0 R >>\nstartxref\n%d\n%%%%EOF\n" % (len(objects) + 1, table)
-    return bytes(out)
+            known = "".join(letter if ord(letter) in letters else "?" for letter in words)
+            pdf.set_font(FONT, size=scale * size)
+            left = scale * x - pdf.get_string_width(known) / 2
+            pdf.text(left, height - scale * y, known)
+    return bytes(pdf.output())
+
+
+def _font_file() -> Path:
+    """Return the path of the font that matplotlib brings, without importing it."""
+    spec = find_spec("matplotlib")
+    if spec is None or not spec.submodule_search_locations:
+        raise missing_library("a sheet as PDF", ("matplotlib",), "all")
+    return Path(spec.submodule_search_locations[0], "mpl-data", "fonts", "ttf", "DejaVuSans.ttf")
