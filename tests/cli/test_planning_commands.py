@@ -128,7 +128,10 @@ def test_a_plan_has_one_focus_and_says_what_it_takes_as_known(
 
 BAD = [
     (("box:1,1", *LENS, "--stations", "ring:6"), "object: box of 1, 1, expected 3 positive sizes LX,LY,LZ"),
-    (("ball:1", *LENS, "--stations", "ring:6"), "expected points (.csv), a mesh (.stl, .ply, .obj, .3mf) or one of box"),
+    (
+        ("ball:1", *LENS, "--stations", "ring:6"),
+        "expected points (.csv), a mesh (.stl, .ply, .obj, .3mf) or one of box",
+    ),
     (
         ("plate:1,1", "--camera", "full-frame-24", "--sigma-px", "1", "--stations", "ring:6"),
         "no focal length",
