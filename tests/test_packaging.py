@@ -75,14 +75,14 @@ def test_licences_of_all_that_is_shipped_are_named() -> None:
 
 def test_the_package_brings_colmap_and_no_library_of_an_extra() -> None:
     extras = PROJECT["optional-dependencies"]
-    assert set(extras) == {"cluster", "exchange", "mark", "photographs", "all", "docs", "dev"}
+    assert set(extras) == {"cluster", "exchange", "mark", "pdf", "photographs", "all", "docs", "dev"}
     assert (
         extras["all"] == ["kolinear[cluster,exchange,mark,photographs]"] and "kolinear[all]" in extras["dev"]
     )
     core = " ".join(PROJECT["dependencies"])
     assert "pycolmap>=4.2,<4.3" in PROJECT["dependencies"]
     extra = r"dask|distributed|cryptography|starlette|uvicorn|heif|rawpy|\bav\b|pytest|mypy"
-    extra += "|pyproj|laspy|lazrs|pye57|trimesh|lxml|networkx"
+    extra += "|pyproj|laspy|lazrs|pye57|trimesh|lxml|networkx|weasyprint"
     assert not re.search(extra, core)
 
 

@@ -16,6 +16,7 @@ from sfm.model.remarks.row import Severity
 from sfm.model.remarks.verdict import Line, Verdict, split_lines
 from sfm.report.findings import Findings
 from sfm.report.page import Banner
+from sfm.report.pdf import write_pdf
 from sfm.report.phrases import (
     describe_calibration,
     describe_check,
@@ -37,7 +38,24 @@ COLUMN_GAP = 2  # characters between columns
 STYLES: dict[Severity, str] = {"error": "red", "warning": "yellow", "note": "dim"}
 
 
-def print_result(findings: Findings, page: Path, *, seconds: float, verbose: bool) -> bool:
+def print_page(what: str, page: Path, *, pdf: bool) -> None:
+    """Print the path of a page that was written.
+
+    Args:
+        what: what the page is, such as Report.
+        page: path of the page.
+        pdf: whether to write it as PDF too.
+
+    Raises:
+        OutputError: it cannot be printed.
+    """
+    console = Console(highlight=False)
+    console.print(Text(f"{what}: {page}", style="bold"), soft_wrap=True)
+    if pdf:
+        console.print(Text(f"PDF: {write_pdf(page)}", style="bold"), soft_wrap=True)
+
+
+def print_result(findings: Findings, page: Path, *, seconds: float, verbose: bool, pdf: bool = False) -> bool:
     """Print the summary of a survey: verdict, figures with units, remarks, failures and path of the report.
 
     Args:
@@ -45,6 +63,7 @@ def print_result(findings: Findings, page: Path, *, seconds: float, verbose: boo
         page: path of the report.
         seconds: duration of the run, s.
         verbose: whether to add details, photographs and cameras.
+        pdf: whether to write the report as PDF too.
 
     Returns:
         Whether the result is dependable.
@@ -80,14 +99,14 @@ def print_result(findings: Findings, page: Path, *, seconds: float, verbose: boo
                 if free
             )
             console.print(Text(f"  camera {camera.name} ({camera.model}): {values}"))
-    console.print(Text(f"Report: {page}", style="bold"), soft_wrap=True)
+    print_page("Report", page, pdf=pdf)
     return verdict.level != "bad"
 
 
-def print_unfinished(reached: UnfinishedSurvey, page: Path) -> None:
+def print_unfinished(reached: UnfinishedSurvey, page: Path, *, pdf: bool = False) -> None:
     """Print why a survey could not be finished, the remarks so far, and the path of its report."""
     print_verdict(verdict(reached))
-    Console(highlight=False).print(Text(f"Report: {page}", style="bold"), soft_wrap=True)
+    print_page("Report", page, pdf=pdf)
 
 
 def print_verdict(verdict: Verdict | Banner) -> None:

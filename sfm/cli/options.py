@@ -92,6 +92,25 @@ Pitch = Annotated[
 ResultFolder = Annotated[Path, typer.Argument(metavar="RESULT", help="Result folder of a survey.")]
 PlanOut = Annotated[Path, typer.Option("--out", metavar="DIR", help="Folder for the page and the tables.")]
 AsJson = Annotated[bool, typer.Option("--json", help="Print JSON instead of a table.")]
+
+
+def _refuse_unprintable(asked: bool) -> bool:
+    """Refuse --pdf before any work where nothing prints pages."""
+    if asked:
+        from sfm.report.pdf import pdf_printer
+
+        pdf_printer()
+    return asked
+
+
+Pdf = Annotated[
+    bool,
+    typer.Option(
+        "--pdf",
+        callback=_refuse_unprintable,
+        help="Also print the page into a PDF beside it: A4, with header, page numbers and a place to sign.",
+    ),
+]
 OpenPage = Annotated[bool, typer.Option("--open/--no-open", help="Open the page in the browser.")]
 Frames = Annotated[
     int | None,

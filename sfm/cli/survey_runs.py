@@ -43,7 +43,7 @@ class SurveyProduct(Protocol):
     def write(self, result: SurveyResult, part: Path, folder: Path) -> None:
         """Write further files into the folder of the result, which is complete later and named otherwise."""
 
-    def show(self, folder: Path) -> bool:
+    def show(self, folder: Path, *, pdf: bool = False) -> bool:
         """Print the product in place of the summary; return whether the result is dependable."""
 
 
@@ -61,6 +61,7 @@ class RunOptions:
     weighted: bool = False  # whether that orientation is observed, not fixed
     overwrite: bool = False  # whether a result of other photographs is replaced
     pictures_mb: float = 0.0  # largest size of the pictures in the report, 10^6 bytes
+    pdf: bool = False  # whether the pages are written as PDF too
     product: SurveyProduct | None = None  # what is made of the survey, beside its report
 
 
@@ -152,7 +153,7 @@ def run_survey_file(survey_file: Path, options: RunOptions) -> Path:
         history, work = RunHistory.of_user(), work_of(survey, files)
         drawn.countdown.expected = expected_seconds(work, history.read())
         log.start(survey.name, survey_file, **origin.written(folder))
-        with reporting_unfinished(folder, log, jobs=workers):
+        with reporting_unfinished(folder, log, jobs=workers, pdf=options.pdf):
             result = run_survey(
                 survey, images_dir=images, jobs=workers, others=others, store=store, progress=log
             )
@@ -182,22 +183,23 @@ def run_survey_file(survey_file: Path, options: RunOptions) -> Path:
             history.add(Run(work, drawn.finished()))
     seconds = time.perf_counter() - begun
     if options.product is not None:
-        dependable = options.product.show(folder)
+        dependable = options.product.show(folder, pdf=options.pdf)
     else:
-        dependable = print_result(findings, page, seconds=seconds, verbose=options.verbose)
+        dependable = print_result(findings, page, seconds=seconds, verbose=options.verbose, pdf=options.pdf)
     if not dependable:
         raise SystemExit(FAILED)
     return folder
 
 
 @contextmanager
-def reporting_unfinished(folder: Path, log: SurveyLog, *, jobs: int = 1) -> Iterator[None]:
+def reporting_unfinished(folder: Path, log: SurveyLog, *, jobs: int = 1, pdf: bool = False) -> Iterator[None]:
     """Write and print how far a survey came that a stage could not finish.
 
     Args:
         folder: of the result.
         log: of the survey; it ends in the folder.
         jobs: photographs drawn at the same time.
+        pdf: whether to write the report as PDF too.
 
     Raises:
         SystemExit: the survey was not finished.
@@ -213,7 +215,7 @@ def reporting_unfinished(folder: Path, log: SurveyLog, *, jobs: int = 1) -> Iter
         page = write_unfinished(
             reached, folder, finish=lambda part: log.close_into(part, reached), jobs=jobs, progress=log
         )
-        print_unfinished(reached, page)
+        print_unfinished(reached, page, pdf=pdf)
         raise SystemExit(FAILED) from error
 
 

@@ -8,7 +8,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from sfm.cli.console import print_verdict
+from sfm.cli.console import print_page, print_verdict
 from sfm.cli.watching import WatchedSurvey
 from sfm.model.errors import GeometryError
 
@@ -39,12 +39,12 @@ class SurveySoFar(WatchedSurvey):
         except GeometryError:
             self.further = None
 
-    def show(self, folder: Path) -> bool:
+    def show(self, folder: Path, *, pdf: bool = False) -> bool:
         """Print the verdict."""
         assert self.result is not None
         verdict = self.result.verdict
         print_verdict(verdict)
-        print(f"Report: {folder / 'report.html'}")
+        print_page("Report", folder / "report.html", pdf=pdf)
         self.is_dependable = verdict.level != "bad"
         return self.is_dependable
 

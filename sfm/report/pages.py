@@ -63,6 +63,7 @@ NO_SOURCE = "'none'"  # of a Content-Security-Policy
 WIDTH = 100  # of the text, columns
 MARGIN = "  "  # before a line of text
 MAX_ROWS = 10  # rows of a table in the text
+HEADER_LETTERS = 80  # of the line above each printed page
 NAME_WIDTH = 36  # maximum width of the name of a fact
 
 
@@ -119,7 +120,8 @@ def write_declared(page: Page, out: Path, *, also: Callable[[Path], None] | None
 
 def html(page: Page) -> str:
     """Return a page as HTML."""
-    style, script = source("base.css") + source("report.css"), source("tables.js")
+    style = source("base.css") + source("report.css") + _running_header(f"{page.kind}: {page.title}")
+    script = source("tables.js")
     policy = content_policy(
         [style, page.viewer.style] if page.viewer else [style],
         [page.viewer.script, script] if page.viewer else [script],
@@ -127,6 +129,13 @@ def html(page: Page) -> str:
     )
     parts = {"style": Markup(style), "tables_script": Markup(script), "policy": policy}
     return _template().render(page=page, **parts)
+
+
+def _running_header(text: str) -> str:
+    """Return a style rule that prints a text above each page; any character is escaped, as CSS allows."""
+    shown = text if len(text) <= HEADER_LETTERS else f"{text[: HEADER_LETTERS - 3]}..."
+    escaped = "".join(f"\\{ord(letter):x} " for letter in shown)
+    return f'@page {{ @top-left {{ content: "{escaped}"; }} @top-right {{ content: "Kolinear"; }} }}\n'
 
 
 def data_url(data: bytes, kind: str) -> str:

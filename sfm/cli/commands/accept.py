@@ -7,7 +7,7 @@ from typing import Annotated
 
 import typer
 
-from sfm.cli.options import ResultFolder
+from sfm.cli.options import Pdf, ResultFolder
 from sfm.cli.process import loading
 from sfm.runtime.faults import working_on
 
@@ -44,6 +44,7 @@ def accept(
     out: Annotated[
         Path, typer.Option("--out", metavar="DIR", help="Folder for the table and the page.")
     ] = Path("out/acceptance"),
+    pdf: Pdf = False,
 ) -> None:
     """Test a result against calibrated lengths (VDI/VDE 2634).
 
@@ -52,7 +53,7 @@ def accept(
     """
     with loading():
         from adapters.formats.result_tables import read_result, read_scale_sources
-        from sfm.cli.console import exit_by, print_verdict
+        from sfm.cli.console import exit_by, print_page, print_verdict
         from sfm.files.open_folders import refuse_foreign_folder
         from sfm.products.inspection.acceptance import LengthLimit, accept_result, read_lengths
         from sfm.report.pages import write_page
@@ -73,5 +74,5 @@ def accept(
     page = write_page(acceptance, out)
     print_verdict(acceptance.verdict)
     print(f"largest error of a length: {acceptance.largest:.4g} {acceptance.unit}")
-    print(f"Report: {page}")
+    print_page("Report", page, pdf=pdf)
     exit_by(acceptance.verdict)

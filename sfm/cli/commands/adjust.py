@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from sfm.cli.options import AllowOutside, Calibration, Out, Overwrite, SurveyFile, Verbose, Weighted
+from sfm.cli.options import AllowOutside, Calibration, Out, Overwrite, Pdf, SurveyFile, Verbose, Weighted
 from sfm.cli.survey_runs import RunOptions, run_survey_file
 
 
@@ -14,6 +14,7 @@ def adjust(
     overwrite: Overwrite = False,
     allow_outside: AllowOutside = False,
     verbose: Verbose = False,
+    pdf: Pdf = False,
 ) -> None:
     """Run a survey from measured image points to the report.
 
@@ -26,6 +27,7 @@ def adjust(
         out=out,
         allow_outside=allow_outside,
         verbose=verbose,
+        pdf=pdf,
         from_photographs=False,
         camera=camera,
         weighted=camera_weighted,

@@ -8,7 +8,7 @@ from typing import Annotated
 
 import typer
 
-from sfm.cli.options import Overwrite, names_in
+from sfm.cli.options import Overwrite, Pdf, names_in
 from sfm.cli.process import compile_first, loading
 from sfm.cli.survey_runs import lock_folder, reporting_unfinished
 from sfm.runtime.faults import working_on
@@ -43,6 +43,7 @@ def audit(
         typer.Option("--out", metavar="DIR", help="Folder of the result.  [default: out/NAME_audit]"),
     ] = None,
     overwrite: Overwrite = False,
+    pdf: Pdf = False,
 ) -> None:
     """Judge a model of another program by its own image points.
 
@@ -56,7 +57,7 @@ def audit(
     with loading():
         from adapters.formats.content import ALL, losses
         from adapters.formats.registry import read_content
-        from sfm.cli.console import exit_by, print_verdict
+        from sfm.cli.console import exit_by, print_page, print_verdict
         from sfm.files.open_folders import refuse_foreign_folder
         from sfm.model.display import listed
         from sfm.pipeline import run_survey
@@ -96,7 +97,7 @@ def audit(
         SurveyLog(watch=drawn) as log,
     ):
         log.start(audited.name, model, **origin.written(folder))
-        with reporting_unfinished(folder, log):
+        with reporting_unfinished(folder, log, pdf=pdf):
             result = run_survey(audited, jobs=cores(), progress=log)
         findings = findings_of(result)
         page = page_of(audit_of(stated_model, stated, findings.result, notes=notes), report="report.html")
@@ -111,6 +112,6 @@ def audit(
     for note in notes:
         print(f"{model}: {note}")
     print(replace(page, sections=page.sections[:SHOWN]).text)
-    print(f"Report: {folder / 'report.html'}")
-    print(f"Audit: {folder / page.path}")
+    print_page("Report", folder / "report.html", pdf=pdf)
+    print_page("Audit", folder / page.path, pdf=pdf)
     exit_by(page.verdict)

@@ -16,7 +16,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 from threadpoolctl import threadpool_limits
 
-from sfm.cli.options import AllowOutside, PicturesMb, Verbose
+from sfm.cli.options import AllowOutside, Pdf, PicturesMb, Verbose
 from sfm.cli.process import FAILED, compile_first, loading
 from sfm.cli.survey_runs import drafted_beside
 from sfm.model.errors import (
@@ -73,6 +73,7 @@ def batch(
     ] = False,
     allow_outside: AllowOutside = False,
     verbose: Verbose = False,
+    pdf: Pdf = False,
 ) -> None:
     """Run many surveys in parallel, each with a report.
 
@@ -127,6 +128,13 @@ def batch(
             without_draft=without_draft,
         )
     print_batch(Console(highlight=False), rows, out / "index.html")
+    if pdf:
+        from sfm.cli.console import print_page
+
+        for row in rows:
+            if (out / row.folder / "report.html").is_file():
+                print_page(f"Report of {row.survey}", out / row.folder / "report.html", pdf=True)
+        print_page("Index", out / "index.html", pdf=True)
     if any(row.fault for row in rows):
         raise SystemExit(FAULT)
     if not all(row.succeeded for row in rows):

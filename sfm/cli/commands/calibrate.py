@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from sfm.cli.options import Jobs, Out, Overwrite, Pitch, SurveyOrPhotographs
+from sfm.cli.options import Jobs, Out, Overwrite, Pdf, Pitch, SurveyOrPhotographs
 from sfm.cli.survey_runs import RunOptions, run_survey_file, stated_or_drafted
 from sfm.cli.watching import WatchedSurvey, run_or_watch
 from sfm.model.errors import KolinearError
@@ -65,6 +65,7 @@ def calibrate(
     ] = 0.0,
     overwrite: Overwrite = False,
     jobs: Jobs = None,
+    pdf: Pdf = False,
 ) -> None:
     """Calibrate cameras from photographs, and judge the result.
 
@@ -111,6 +112,7 @@ def calibrate(
             from_photographs=None if images is None else True,
             overwrite=overwrite,
             pictures_mb=15.0,
+            pdf=pdf,
             product=product,
         )
         run_survey_file(survey_file, options)
@@ -175,9 +177,9 @@ class _Product(WatchedSurvey):
                 )
                 write_result(solution, part / splined_folder(camera))
 
-    def show(self, folder: Path) -> bool:
+    def show(self, folder: Path, *, pdf: bool = False) -> bool:
         """Print the verdict and the figures of the cameras."""
-        from sfm.cli.console import print_verdict
+        from sfm.cli.console import print_page, print_verdict
         from sfm.files.plain_text import as_plain
         from sfm.report.page import Heading, Statement, Table
 
@@ -186,15 +188,15 @@ class _Product(WatchedSurvey):
         print_verdict(declared.verdict)
         self.is_dependable = declared.verdict.level != "bad"
         if self.is_watched:
-            print(f"Calibration: {folder / declared.path}")
+            print_page("Calibration", folder / declared.path, pdf=pdf)
             return self.is_dependable
         for part in (part for section in declared.sections if section.key in SHOWN for part in section.parts):
             if isinstance(part, Heading | Statement):
                 print(as_plain(part.text))
             elif isinstance(part, Table):
                 print("".join(f"  {line}\n" for line in part.text.splitlines()), end="")
-        print(f"Report: {folder / 'report.html'}")
-        print(f"Calibration: {folder / declared.path}")
+        print_page("Report", folder / "report.html", pdf=pdf)
+        print_page("Calibration", folder / declared.path, pdf=pdf)
         return self.is_dependable
 
     def uncertainty(self) -> float:

@@ -9,7 +9,7 @@ from typing import Annotated
 
 import typer
 
-from sfm.cli.options import names_in
+from sfm.cli.options import Pdf, names_in
 from sfm.cli.process import loading
 from sfm.model.display import counted
 from sfm.runtime.faults import working_on
@@ -52,6 +52,7 @@ def compare(
     out: Annotated[
         Path, typer.Option("--out", metavar="DIR", help="Folder for the table, JSON and page.")
     ] = Path("out/comparison"),
+    pdf: Pdf = False,
 ) -> None:
     """Compare two results, or two calibrated cameras.
 
@@ -62,7 +63,7 @@ def compare(
     with loading():
         from adapters.formats.registry import read_comparable
         from sfm.cli.compared_cameras import compared_as_cameras, difference_of_files
-        from sfm.cli.console import exit_by, print_verdict
+        from sfm.cli.console import exit_by, print_page, print_verdict
         from sfm.comparison.comparison_remarks import verdict_of_comparison
         from sfm.comparison.significance import compare_results
         from sfm.files.open_folders import refuse_foreign_folder
@@ -76,7 +77,7 @@ def compare(
             difference = difference_of_files(a, b, a_format, b_format, camera=camera, distance=distance)
         page = write_page(difference, out, also=lambda folder: write_picture(difference, folder))
         print_verdict(verdict_of_difference(difference))
-        print(f"Report: {page}")
+        print_page("Report", page, pdf=pdf)
         return
     with working_on(str(a)):
         first = read_comparable(a, a_format)
@@ -96,5 +97,5 @@ def compare(
     print_verdict(verdict)
     if comparison.points:
         print(f"largest difference of a point: {largest_difference(comparison)}")
-    print(f"Report: {page}")
+    print_page("Report", page, pdf=pdf)
     exit_by(verdict)

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from sfm.cli.options import names_in
+from sfm.cli.options import Pdf, names_in
 from sfm.cli.process import loading
 from sfm.model.errors import SurveyFileError
 from sfm.runtime.faults import working_on
@@ -66,13 +66,14 @@ def epochs(
     out: Annotated[
         Path, typer.Option("--out", metavar="DIR", help="Folder for the tables, JSON and page.")
     ] = Path("out/epochs"),
+    pdf: Pdf = False,
 ) -> None:
     """Find what moved between surveys of one object.
 
     Reports the congruency test, the stable points, displacements with their tests, and motions of groups.
     """
     with loading():
-        from sfm.cli.console import exit_by, print_verdict
+        from sfm.cli.console import exit_by, print_page, print_verdict
         from sfm.files.open_folders import refuse_foreign_folder
         from sfm.model.distributions import FALSE_ALARM
         from sfm.products.epochs.page import describe_block, describe_stable
@@ -113,7 +114,7 @@ def epochs(
         print(f"  {describe_stable(pair.displacements)}")
         for block in pair.blocks:
             print(f"  {describe_block(block)}")
-    print(f"Report: {page}")
+    print_page("Report", page, pdf=pdf)
     exit_by(verdict)
 
 

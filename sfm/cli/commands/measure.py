@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
+from sfm.cli.options import Pdf
 from sfm.cli.process import loading
 from sfm.model.display import counted
 from sfm.runtime.faults import working_on
@@ -36,6 +37,7 @@ def measure(
     outside: Annotated[
         bool, typer.Option("--allow-outside", help="Let the features file refer to files outside its folder.")
     ] = False,
+    pdf: Pdf = False,
 ) -> None:
     """Measure shapes, distances and tolerances in a result.
 
@@ -44,7 +46,7 @@ def measure(
     with loading():
         from adapters.formats.mesh import read_mesh
         from adapters.formats.registry import read_comparable
-        from sfm.cli.console import exit_by, print_verdict
+        from sfm.cli.console import exit_by, print_page, print_verdict
         from sfm.files.open_folders import refuse_foreign_folder
         from sfm.products.inspection.features_file import read_features_file
         from sfm.products.inspection.measurement import measure_result
@@ -74,7 +76,7 @@ def measure(
         print(f"{line}{f'; {remark}' if remark else ''}")
     if len(rows) > MAX_PRINTED:
         print(f"and {len(rows) - MAX_PRINTED} more in {page.with_name('quantities.csv')}")
-    print(f"Report: {page}")
+    print_page("Report", page, pdf=pdf)
     exit_by(measurement.verdict)
 
 

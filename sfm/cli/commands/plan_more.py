@@ -7,7 +7,7 @@ from typing import Annotated
 
 import typer
 
-from sfm.cli.options import PlanOut, ResultFolder
+from sfm.cli.options import Pdf, PlanOut, ResultFolder
 from sfm.cli.process import loading
 from sfm.model.errors import GeometryError
 from sfm.runtime.faults import working_on
@@ -27,6 +27,7 @@ def plan_more(
         ),
     ] = 60.0,
     out: PlanOut = Path("out/more"),
+    pdf: Pdf = False,
 ) -> None:
     """Propose further photographs that improve the weakest points.
 
@@ -36,7 +37,7 @@ def plan_more(
     with loading():
         from adapters.formats.control_tables import read_given
         from adapters.formats.result_tables import read_result
-        from sfm.cli.console import exit_by, print_verdict
+        from sfm.cli.console import exit_by, print_page, print_verdict
         from sfm.files.open_folders import refuse_foreign_folder
         from sfm.products.planning.plan import further_photographs, image_sigma, with_image_sigma
         from sfm.report.pages import page_of, write_declared
@@ -58,5 +59,5 @@ def plan_more(
     path = write_declared(page, out)
     print_verdict(page.verdict)
     print(page.text)
-    print(f"Report: {path}")
+    print_page("Report", path, pdf=pdf)
     exit_by(page.verdict)

@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from sfm.cli.options import PlanOut
+from sfm.cli.options import Pdf, PlanOut
 from sfm.cli.planning_inputs import (
     PlannedSetup,
     bars_of,
@@ -167,6 +167,7 @@ def plan_network(
         ),
     ] = None,
     out: PlanOut = Path("out/plan"),
+    pdf: Pdf = False,
 ) -> None:
     """Predict the precision of a network, or design a network.
 
@@ -177,7 +178,7 @@ def plan_network(
     with loading():
         import numpy as np
 
-        from sfm.cli.console import exit_by, print_verdict
+        from sfm.cli.console import exit_by, print_page, print_verdict
         from sfm.files.open_folders import refuse_foreign_folder
         from sfm.model.conventions import METRES
         from sfm.products.planning.designer import StationLimits, design_network
@@ -247,7 +248,7 @@ def plan_network(
         print(f"  weak: point {weak.name}: {weak.reason}")
     if len(network_plan.weak) > MAX_WEAK:
         print(f"  ... and {len(network_plan.weak) - MAX_WEAK} more weak points, listed in the page")
-    print(f"Report: {page}")
+    print_page("Report", page, pdf=pdf)
     exit_by(verdict)
 
 

@@ -9,6 +9,7 @@ from typing import Annotated
 
 import typer
 
+from sfm.cli.options import Pdf
 from sfm.cli.process import loading
 from sfm.runtime.faults import working_on
 
@@ -24,6 +25,7 @@ def plan_simulate(
         Path,
         typer.Option("--out", metavar="DIR", help="Folder for the photographs, survey file and result."),
     ] = Path("out/simulation"),
+    pdf: Pdf = False,
 ) -> None:
     """Render the photographs of a plan, run the survey, and compare it with the prediction.
 
@@ -31,6 +33,7 @@ def plan_simulate(
     deviations are compared with the achieved ones and with the true errors.
     """
     with loading():
+        from sfm.cli.console import print_page
         from sfm.files.open_folders import locked, refuse_foreign_folder
         from sfm.files.whole_files import remove_leftovers, whole_folder
         from sfm.library.surveys import run_survey
@@ -59,4 +62,4 @@ def plan_simulate(
     if achieved.mount_ratio_squared is not None:
         rms = achieved.mount_ratio_squared**0.5
         print(f"true errors of mounts: {rms:.3f} times their standard deviations, RMS")
-    print(f"Report: {out / 'result' / 'report.html'}")
+    print_page("Report", out / "result" / "report.html", pdf=pdf)

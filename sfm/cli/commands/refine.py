@@ -7,7 +7,7 @@ from typing import Annotated
 
 import typer
 
-from sfm.cli.options import names_in
+from sfm.cli.options import Pdf, names_in
 from sfm.cli.process import FAILED, compile_first, loading
 from sfm.runtime.faults import working_on
 
@@ -57,6 +57,7 @@ def refine(
             help="Survey file with coded targets, control and scale bars to add to the model.",
         ),
     ] = None,
+    pdf: Pdf = False,
 ) -> None:
     """Remeasure the key points of a COLMAP model.
 
@@ -77,6 +78,7 @@ def refine(
             place_model,
             update_model,
         )
+        from sfm.cli.console import print_page
         from sfm.files.whole_files import refuse_unwritable, whole_folder
         from sfm.products.refining.oriented_windows import measure_model_targets
         from sfm.products.refining.page import Numbers, describe_key_points
@@ -130,6 +132,6 @@ def refine(
             (folder / name).write_text(text, encoding="utf-8")
     print(describe_key_points(refinement, numbers))
     print(f"Model: {out}")
-    print(f"Report: {out / 'refinement.html'}")
+    print_page("Report", out / page.path, pdf=pdf)
     if not refinement.dependable:
         raise SystemExit(FAILED)

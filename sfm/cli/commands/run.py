@@ -14,6 +14,7 @@ from sfm.cli.options import (
     Jobs,
     Out,
     Overwrite,
+    Pdf,
     PicturesMb,
     Pitch,
     SurveyOrPhotographs,
@@ -61,6 +62,7 @@ def run(
     pictures_mb: PicturesMb = 15.0,
     allow_outside: AllowOutside = False,
     verbose: Verbose = False,
+    pdf: Pdf = False,
 ) -> None:
     """Run a survey from its photographs to the report.
 
@@ -100,6 +102,7 @@ def run(
             weighted=camera_weighted,
             overwrite=overwrite,
             pictures_mb=pictures_mb,
+            pdf=pdf,
             product=rounds if watched else None,
         )
         run_survey_file(file, options)

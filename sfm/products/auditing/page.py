@@ -157,7 +157,7 @@ def _cameras(audit: Audit) -> Iterator[Part]:
         )
     strong = audit.result.orientation_correlations
     if strong:
-        words = "; ".join(f"{of.parameter} with {', '.join(of.partners)}" for of in strong)
+        words = "; ".join(f"{of.parameter} with {of.partners}" for of in strong)
         yield Paragraph(f"Correlated with the orientation of photographs: {words}.")
 
 

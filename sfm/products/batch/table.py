@@ -32,6 +32,7 @@ from sfm.report.phrases import fixed
 from sfm.runtime.compiling import COMPILING
 
 PAGES = ("batch.json", "batch.csv", "index.html")  # the first identifies them
+PRINTED = "index.pdf"  # where it was asked for
 COLOURS = {"good": "green", "fair": "yellow", "bad": "red", "": "red"}
 RECENT = 8  # finished surveys that remain visible
 REFRESHES_PER_SECOND = 4
@@ -194,6 +195,8 @@ def write_batch_pages(rows: Sequence[SurveyRow], out: Path) -> None:
         OutputError: they cannot be written.
     """
     texts = texts_of(batch_page(rows, out.name))
+    if PRINTED in read_manifest(out):
+        (out / PRINTED).unlink(missing_ok=True)  # it shows an earlier batch
     with whole_files(out) as part:
         for name in PAGES:
             (part / name).write_bytes(texts[name].encode())
@@ -208,7 +211,7 @@ def refuse_foreign_pages(out: Path) -> None:
         raise OutputError(
             f"{as_plain(str(out))}: the path has control or invisible characters; needed another --out"
         )
-    if not read_manifest(out).keys() <= {MANIFEST, *PAGES}:
+    if not read_manifest(out).keys() <= {MANIFEST, PRINTED, *PAGES}:
         raise OutputError(
             f"{out}: the folder contains '{MANIFEST}' of a result, not of a batch; needed another --out"
         )
