@@ -1,4 +1,4 @@
-"""The text of PDF files with embedded fonts, as a reader would copy it; as much of the format as the tests need.
+"""The text of PDF files with embedded fonts, page by page, as far as the tests need the format.
 
 Source: ISO 32000-1:2008, secs. 7.3.4 (strings), 9.4.3 (showing text), 9.10.3 (ToUnicode).
 """

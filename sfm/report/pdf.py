@@ -42,8 +42,8 @@ def pdf_printer() -> Printer:
     if find_spec("weasyprint") is not None:
         return _print_by_weasyprint
     raise MissingLibraryError(
-        "--pdf needs Chromium, Chrome or Edge on the path, or WeasyPrint; install one of them, the last with: "
-        "pip install 'kolinear[pdf]'"
+        "--pdf needs Chromium, Chrome or Edge on the path, or WeasyPrint; install one of them, the last "
+        "with: pip install 'kolinear[pdf]'"
     )
 
 

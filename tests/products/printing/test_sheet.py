@@ -1,7 +1,6 @@
 """Sheets of coded targets: read back by the detector, true scale, files whole or not at all."""
 
 import re
-import zlib
 from dataclasses import replace
 from xml.etree import ElementTree
 
@@ -16,6 +15,7 @@ from sfm.products.rendering.render import render_photograph
 from sfm.products.rendering.scene import CircularTargets, Faces, Optics, Scene
 from sfm.targets.codes.plates import code_family
 from sfm.targets.detect import find_targets
+from tests.pdf_text import pages_of, streams_of
 
 PX_PER_MM = 8
 
@@ -155,13 +155,6 @@ def test_all_numbers_are_on_pages_that_they_fit_on():
         assert apart.min() > 1.3 * sheet.ring_mm
 
 
-def page_streams(content):
-    """Return the drawing operators of each page of a PDF."""
-    streams = re.findall(rb"stream\n(.*?)\nendstream", content, re.DOTALL)
-    packed = [zlib.decompress(stream) for stream in streams if stream[:1] == b"\x78"]
-    return [stream for stream in packed if b" Tj ET" in stream]
-
-
 def printed_outlines(stream, height_mm):
     """Return what a page fills: corners and ends of curves on the paper, mm from its lower left corner."""
     outlines = []
@@ -171,28 +164,6 @@ def printed_outlines(stream, height_mm):
     return outlines
 
 
-def printed_texts(content):
-    """Return the texts of a PDF page by page, read through the table of its embedded font."""
-    assert b"/FontFile2" in content and b"/Subtype /Type1" not in content
-    letter = {
-        bytes.fromhex(code.decode()): bytes.fromhex(text.decode()).decode("utf-16-be")
-        for code, text in re.findall(rb"<([0-9A-F]{4})> <([0-9A-F]{4,8})>\n", content)
-    }
-    pages = []
-    for stream in page_streams(content):
-        codes = [
-            re.sub(
-                rb"\\(.)",
-                lambda escape: {b"r": b"\r", b"n": b"\n"}.get(escape[1], escape[1]),
-                text,
-                flags=re.S,
-            )
-            for text in re.findall(rb"Td \(((?:[^\\()]|\\.)*)\) Tj ET", stream, re.DOTALL)
-        ]
-        pages.append(["".join(letter[code[i : i + 2]] for i in range(0, len(code), 2)) for code in codes])
-    return pages
-
-
 @pytest.mark.parametrize("page", ["a4", "letter", "a2"])
 def test_marks_of_a_pdf_are_true_on_paper(tmp_path, page):
     sheet = lay_out_sheet("ring14", np.arange(1, 101), diameter_mm=10.0, page=page)
@@ -200,7 +171,7 @@ def test_marks_of_a_pdf_are_true_on_paper(tmp_path, page):
     content = file.read_bytes()
     box = re.search(rb"/MediaBox \[0 0 ([\d.]+) ([\d.]+)\]", content)
     np.testing.assert_allclose(np.array(box.groups(), dtype=float) * 25.4 / 72, sheet.size_mm, atol=0.002)
-    streams = page_streams(content)
+    streams = [stream for stream in streams_of(content).values() if b" Tj ET" in stream]
     assert len(streams) == len(sheet.pages)
     for stream, laid in zip(streams, sheet.pages, strict=True):
         outlines = printed_outlines(stream, sheet.size_mm[1])
@@ -250,7 +221,8 @@ def test_any_name_of_a_code_table_is_written_as_text(tmp_path, name):
     texts = [t.text for t in ElementTree.parse(svg).getroot().iter("{http://www.w3.org/2000/svg}text")]
     assert texts[-1].startswith(f"{shown}, dot 10 mm")
     (pdf,) = write_sheet(sheet, tmp_path / "k.pdf")
-    (said,) = printed_texts(pdf.read_bytes())
+    (page,) = pages_of(pdf.read_bytes())
+    said = page.splitlines()
     assert said[:-1] == ["1", "2", "3", "4"]
     known = re.sub("[日本]", "?", shown)  # of which the font has no letters
     assert said[-1].startswith(f"{known}, dot 10 mm")
