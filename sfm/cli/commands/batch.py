@@ -130,10 +130,14 @@ def batch(
     print_batch(Console(highlight=False), rows, out / "index.html")
     if pdf:
         from sfm.cli.console import print_page
+        from sfm.products.batch.job import note_finished, was_finished
 
-        for row in rows:
-            if (out / row.folder / "report.html").is_file():
-                print_page(f"Report of {row.survey}", out / row.folder / "report.html", pdf=True)
+        for folder in (out / row.folder for row in rows if row.folder):
+            noted = was_finished(folder)
+            if (folder / "report.html").is_file():
+                print_page("Report", folder / "report.html", pdf=True)
+            if noted:
+                note_finished(folder)  # with its PDF
         print_page("Index", out / "index.html", pdf=True)
     if any(row.fault for row in rows):
         raise SystemExit(FAULT)
