@@ -10,6 +10,7 @@ import pytest
 
 from adapters.formats.content import Content
 from adapters.formats.registry import write_content
+from sfm.adjustment.quality.correlations import OrientationCorrelation
 from sfm.model.errors import GeometryError
 from sfm.model.estimate import Estimate
 from sfm.model.network import Network
@@ -130,6 +131,16 @@ def test_parameters_are_held_and_named() -> None:
     assert "change / sigma" in text and "cx" not in text
     with pytest.raises(GeometryError, match="parameter 'cz' is to be held"):
         survey_of_model(model, stated_of(model), fixed=("cz",))
+
+
+def test_correlations_with_orientations_are_words() -> None:
+    network, truth = network_of("words")
+    audit = audited(model_of(network, truth))
+    strong = OrientationCorrelation("c of camera a", 0.99, "Z0", network.images[0], (("Z0", 1),))
+    page = page_of(
+        replace(audit, result=replace(audit.result, orientation_correlations=(strong,))), report="r"
+    )
+    assert f"photographs: c of camera a with {strong.partners}." in page.text
 
 
 def test_cameras_are_told_by_their_photographs_whatever_their_names() -> None:
