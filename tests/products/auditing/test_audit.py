@@ -137,10 +137,8 @@ def test_correlations_with_orientations_are_words() -> None:
     network, truth = network_of("words")
     audit = audited(model_of(network, truth))
     strong = OrientationCorrelation("c of camera a", 0.99, "Z0", network.images[0], (("Z0", 1),))
-    page = page_of(
-        replace(audit, result=replace(audit.result, orientation_correlations=(strong,))), report="r"
-    )
-    assert f"photographs: c of camera a with {strong.partners}." in " ".join(page.text.split())
+    shown = replace(audit, result=replace(audit.result, orientation_correlations=(strong,)))
+    assert f"photographs: c of camera a with {strong.partners}." in html_of(shown, report="r")
 
 
 def test_cameras_are_told_by_their_photographs_whatever_their_names() -> None:

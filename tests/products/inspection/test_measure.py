@@ -102,9 +102,15 @@ points = "plate"
 upper = 0.001
 """
 )
-SLAB = "solid s\n" + "".join(
-    "facet\n" + "".join(f"vertex {x} {y} 0\n" for x, y in corners)
-    for corners in (((-1, -1), (1, -1), (1, 1)), ((-1, -1), (1, 1), (-1, 1)))
+SLAB = (
+    "solid s\n"
+    + "".join(
+        "facet normal 0 0 1\nouter loop\n"
+        + "".join(f"vertex {x} {y} 0\n" for x, y in corners)
+        + "endloop\nendfacet\n"
+        for corners in (((-1, -1), (1, -1), (1, 1)), ((-1, -1), (1, 1), (-1, 1)))
+    )
+    + "endsolid s\n"
 )
 
 
