@@ -7,7 +7,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass, field, replace
-from pathlib import Path
+from pathlib import Path, PurePosixPath
 from typing import NamedTuple
 from zlib import crc32
 
@@ -21,6 +21,7 @@ from sfm.model.network import ImagePoints, InteriorObservations, Network, Object
 from sfm.model.reduced_network import reduce_network
 from sfm.model.solution import NO_SCALE, UNCODED, Solution
 
+UNSTATED = "not stated"  # name of the camera that stands for one that a file does not state
 PAIRS = ((0, 1), (0, 2), (1, 2))  # of coordinates, for cXY, cXZ and cYZ
 
 
@@ -105,6 +106,16 @@ def _kind(name: str, words: str) -> Callable[[Rows], Rows]:
 @_kind("exterior orientations", "exterior orientations")
 def _oriented(content: Content) -> FloatArray:
     return np.flatnonzero(content.result.estimate.oriented)[:, None].astype(float)
+
+
+@_kind("cameras", "interior orientations of photographs")
+def _cameras(content: Content) -> FloatArray:
+    """Return the photographs with a camera that is stated; cameras without photographs likewise, (n, 1)."""
+    network, estimate = content.result.network, content.result.estimate
+    stated = np.array([camera.name != UNSTATED for camera in estimate.cameras], dtype=bool)
+    if not network.images:
+        return np.flatnonzero(stated)[:, None].astype(float)
+    return np.flatnonzero(stated[network.camera])[:, None].astype(float)
 
 
 @_kind("object points", "coordinates of points")
@@ -354,25 +365,29 @@ def content_of_points(
     xyz: FloatArray,
     sigma: FloatArray | None,
     *,
+    names: tuple[str, ...] | None = None,
     unit: str = "",
     crs: str = "",
     notes: tuple[str, ...] = (),
 ) -> Content:
-    """Return points alone, which a file only numbers, as a survey.
+    """Return points alone as a survey.
 
     Args:
         name: of the survey.
         xyz: coordinates, object unit, (n, 3).
         sigma: their standard deviations, object unit, (n, 3); None if they are not known.
+        names: of the points; None if a file only numbers them.
         unit: object unit; empty where unknown.
         crs: coordinate system in well-known text; empty where unknown.
         notes: remarks on what is read but not used unchanged.
     """
     none = np.zeros(0, dtype=np.int64)
-    network = Network((), none, tuple(f"u{j}" for j in range(len(xyz))), _no_image_points())
+    points = names or tuple(f"u{j}" for j in range(len(xyz)))
+    network = Network((), none, points, _no_image_points())
     estimate = Estimate((), np.zeros((0, 3)), np.zeros((0, 3, 3)), xyz)
-    C = None if sigma is None else np.eye(3) * sigma[:, None, :] ** 2
-    return Content(Solution(name, network, estimate, C, unit=unit, points_named=False), notes=notes, crs=crs)
+    C = None if sigma is None else np.where(np.eye(3, dtype=bool), sigma[:, None, :] ** 2, 0.0)
+    result = Solution(name, network, estimate, C, unit=unit, points_named=names is not None)
+    return Content(result, notes=notes, crs=crs)
 
 
 def points_of(content: Content) -> tuple[FloatArray, FloatArray | None]:
@@ -382,6 +397,14 @@ def points_of(content: Content) -> tuple[FloatArray, FloatArray | None]:
     C = result.point_covariance
     sigma = None if C is None else np.sqrt(np.diagonal(C, axis1=1, axis2=2))[known]
     return result.estimate.points[known], None if sigma is None or not np.isfinite(sigma).all() else sigma
+
+
+def flat_names(images: tuple[str, ...]) -> tuple[str, ...]:
+    """Return names of photographs without their folders, or with them where two would have one name."""
+    names = [PurePosixPath(image).name for image in images]
+    if len(set(names)) < len(names):
+        names = [image.replace("/", "_") for image in images]
+    return tuple(names)
 
 
 def with_cameras(content: Content, network: Network, estimate: Estimate) -> tuple[Content, frozenset[str]]:

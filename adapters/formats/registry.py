@@ -21,6 +21,9 @@ import numpy as np
 from adapters.colmap.camera_models import SIDE_FILE, read_model, write_model
 from adapters.colmap.database import read_database, write_database
 from adapters.colmap.reconstruction import COLMAP_NAMES
+from adapters.formats import agisoft_reference, aicon, micmac, realitycapture
+from adapters.formats.agisoft_reference import read_reference, write_reference
+from adapters.formats.aicon import read_aicon, write_aicon
 from adapters.formats.alicevision import read_alicevision, write_alicevision
 from adapters.formats.bal import read_bal, write_bal
 from adapters.formats.bundle_text import (
@@ -40,6 +43,7 @@ from adapters.formats.e57 import read_e57, write_e57
 from adapters.formats.las import HEAD as LAS_HEAD
 from adapters.formats.las import read_laz, write_laz
 from adapters.formats.metashape import read_metashape, write_metashape
+from adapters.formats.micmac import read_micmac, write_micmac
 from adapters.formats.nerfstudio import read_nerfstudio_poses, write_nerfstudio_poses
 from adapters.formats.nvm import HEADER as NVM_HEADER
 from adapters.formats.nvm import read_nvm, write_nvm
@@ -49,6 +53,9 @@ from adapters.formats.opensfm import read_opensfm, write_opensfm
 from adapters.formats.photomodeler import FREE as PHOTOMODELER_FREE
 from adapters.formats.photomodeler import MODELS as PHOTOMODELER_MODELS
 from adapters.formats.photomodeler import read_export, write_export
+from adapters.formats.point_tables import HEAD as POINTS_HEAD
+from adapters.formats.point_tables import read_geojson, read_points_csv, write_geojson, write_points_csv
+from adapters.formats.realitycapture import read_realitycapture, write_realitycapture
 from adapters.formats.result_tables import read_content as read_tables
 from adapters.formats.result_tables import read_result
 from adapters.formats.result_tables import write_content as write_content_tables
@@ -104,7 +111,11 @@ class FileFormat:
     control: bool = False  # whether `read_all` accepts a control file as keyword
     adjusts: bool = False  # whether it is the input of an adjustment with the standard deviations in it
     recognises: Callable[[str], bool] = lambda head: False  # whether a file is of it, by its beginning
-    marks: tuple[str, ...] = ()  # files in a folder of it, of which one is enough
+    marks: tuple[str, ...] = ()  # patterns of files in a folder of it, of which one is enough
+    flat: bool = False  # whether its names of photographs have no folders
+    keeps_also: Callable[[Content], frozenset[str]] = lambda content: (
+        frozenset()
+    )  # kinds kept of some surveys
 
     def held(self, content: Content) -> frozenset[str]:
         """Return the kinds of content that are unchanged when a survey is read again."""
@@ -114,7 +125,10 @@ class FileFormat:
             in (set(), set(camera.names) & set(self.frees))
             for camera in cameras
         )
-        return self.keeps | {"free"} if frees else self.keeps
+        held = self.keeps | self.keeps_also(content)
+        if self.flat and any("/" in image for image in content.result.network.images):
+            held -= {"image names"}
+        return held | {"free"} if frees else held
 
     @property
     def only_points(self) -> bool:
@@ -146,7 +160,7 @@ _OPENCV_DISTORTION = ("k1", "k2", "p1", "p2")
 _BROWN_DISTORTION = MODELS["brown"].names[3:]
 _FRACTION = ("k4", "k5", "k6")  # of full_opencv, in its denominator
 NUMBERS = (False, False)
-_SOLVED = frozenset({"exterior orientations", "object points", "image points", "uncoded"})
+_SOLVED = frozenset({"cameras", "exterior orientations", "object points", "image points", "uncoded"})
 _NAMED = _SOLVED | {"point names", "image names"}
 _CLOUD = frozenset({"object points", "point sigmas", "crs"})
 _RIGS = frozenset({"rigs", "moments"})
@@ -175,7 +189,7 @@ FORMATS = (
         models=_COLMAP,
         read=read_database,
         write=lambda path, network, estimate: write_database(path, network, estimate.cameras),
-        keeps=frozenset({"image points", "image names", "uncoded"}),
+        keeps=frozenset({"cameras", "image points", "image names", "uncoded"}),
         names=(False, True),
     ),
     FileFormat(
@@ -266,7 +280,7 @@ FORMATS = (
         models=("brown_forward_affine", "full_opencv", "opencv", "opencv_fisheye"),
         read_all=read_nerfstudio_poses,
         write_all=write_nerfstudio_poses,
-        keeps=frozenset({"exterior orientations", "image names"}),
+        keeps=frozenset({"cameras", "exterior orientations", "image names"}),
         placed=True,
         lacks=("b2", *_FRACTION),
         names=(False, True),
@@ -321,10 +335,58 @@ FORMATS = (
         recognises=lambda head: head.startswith("{") and '"sfm_data_version"' in head,
     ),
     FileFormat(
+        name="micmac",
+        models=("brown_forward",),
+        read_all=read_micmac,
+        write_all=write_micmac,
+        keeps=_NAMED - {"object points"} | {"control"},
+        folder=True,
+        square=True,
+        recognises=lambda head: any(root in head for root in micmac.ROOTS),
+        marks=micmac.PLACES,
+        flat=True,
+    ),
+    FileFormat(
+        name="aicon",
+        models=("brown_forward",),
+        read_all=read_aicon,
+        write_all=write_aicon,
+        keeps=_NAMED - {"image names"} | {"scale bars", "image sigmas", "point sigmas", "rejected"},
+        folder=True,
+        placed=True,
+        lacks=("K4",),
+        names=(True, False),
+        adjusts=True,
+        marks=aicon.PLACES,
+    ),
+    FileFormat(
+        name="realitycapture",
+        models=("brown_forward",),
+        read_all=read_realitycapture,
+        write_all=write_realitycapture,
+        keeps=frozenset({"cameras", "exterior orientations", "image names"}),
+        placed=True,
+        lacks=("b1", "b2"),
+        square=True,
+        names=(False, True),
+        recognises=lambda head: head.startswith(realitycapture.HEAD),
+    ),
+    FileFormat(
+        name="agisoft-reference",
+        models=(),
+        read_all=read_reference,
+        write_all=write_reference,
+        keeps=_NAMED - {"cameras", "image points"} | {"control", "checks", "unit", "crs", "unplaced"},
+        folder=True,
+        recognises=lambda head: agisoft_reference.HEAD.match(head) is not None,
+        marks=(agisoft_reference.IMAGES, agisoft_reference.POINTS),
+        keeps_also=agisoft_reference.kinds_kept,
+    ),
+    FileFormat(
         name="rig",
         models=("opencv",),
         write_all=write_rig_files,
-        keeps=frozenset({"rigs", "rig names", "unit"}),
+        keeps=frozenset({"cameras", "rigs", "rig names", "unit"}),
         folder=True,
     ),
     FileFormat(
@@ -348,6 +410,24 @@ FORMATS = (
         recognises=lambda head: head.startswith(E57_HEAD),
     ),
     FileFormat(
+        name="points-csv",
+        models=(),
+        read_all=read_points_csv,
+        write_all=write_points_csv,
+        keeps=_CLOUD | {"point names", "uncoded"},
+        placed=True,
+        recognises=lambda head: POINTS_HEAD.match(head) is not None,
+    ),
+    FileFormat(
+        name="geojson",
+        models=(),
+        read_all=read_geojson,
+        write_all=write_geojson,
+        keeps=_CLOUD | {"point names", "uncoded"},
+        placed=True,
+        recognises=lambda head: head.startswith("{") and '"FeatureCollection"' in head,
+    ),
+    FileFormat(
         name="ply",
         models=(),
         write_all=_write_ply,
@@ -364,6 +444,8 @@ ENDINGS = {
     ".db": "colmap-database",
     ".nvm": "nvm",
     ".sfm": "alicevision",
+    ".csv": "points-csv",
+    ".geojson": "geojson",
 }
 
 
@@ -413,7 +495,7 @@ def format_of(path: Path) -> FileFormat:
         if any(path.glob("*cams*.txt")):
             return format_named("sba")
         for form in FORMATS:
-            if any((path / mark).is_file() for mark in form.marks):
+            if any(file.is_file() for mark in form.marks for file in path.glob(mark)):
                 return form
         raise SurveyFileError(
             f"{path}: neither a COLMAP model, nor tables of a result, nor files of a bundle program are in "
@@ -614,13 +696,17 @@ def describe_stored(name: str, network: Network, estimate: Estimate) -> str:
     if name == "colmap-database":
         return f"{counted(len(network.images), 'photograph')}, {image_points}, no coordinates of points"
     images, points = estimate.oriented, estimate.determined
-    if "object points" not in form.keeps:
-        return f"{counted(int(images.sum()), 'photograph')}, no points"
     if not form.placed:
         images, points = np.ones_like(images), np.ones_like(points)
     seen = network.image_points
     kept = images[seen.image] & (points[seen.point] | (name != "tables"))
-    return (
-        f"{counted(int(images.sum()), 'photograph')}, "
-        f"{counted(int(points.sum()), 'point')}, {counted(int(kept.sum()), 'image point')}"
-    )
+    parts = [counted(int(images.sum()), "photograph")]
+    if "object points" in form.keeps:
+        parts.append(counted(int(points.sum()), "point"))
+    elif "control" in form.keeps:
+        parts.append(counted(len(network.control.complete), "control point"))
+    else:
+        parts.append("no points")
+    if "image points" in form.keeps:
+        parts.append(counted(int(kept.sum()), "image point"))
+    return ", ".join(parts)

@@ -15,19 +15,24 @@ from dataclasses import dataclass, field, replace
 from pathlib import Path, PurePosixPath
 
 import numpy as np
+from scipy.spatial.transform import Rotation
 
 from adapters.formats.cameras.lens_terms import is_rotation, nearest
-from adapters.formats.content import Content
+from adapters.formats.content import UNSTATED, Content
+from adapters.formats.control_tables import object_points
 from adapters.reading.text_lines import MAX_IMAGE_POINTS, MAX_PHOTOGRAPHS, MAX_POINTS, Lines
 from sfm.files.plain_text import MAX_NAME, MAX_SIDE_PX, is_name, shorten
 from sfm.files.result_tables import refuse_moments
-from sfm.model.camera import Camera
+from sfm.model.camera import Camera, camera_from_values
 from sfm.model.conventions import VISION_AXES, FloatArray, IntArray
 from sfm.model.display import counted
 from sfm.model.errors import SurveyFileError
 from sfm.model.estimate import Estimate, Mounts
-from sfm.model.network import ImagePoints, Network
+from sfm.model.network import ExteriorObservations, ImagePoints, Network, ScaleBars
 from sfm.model.solution import Solution
+
+NOMINAL_PX = (3600, 3600)  # of photographs whose size is not stated, with a larger side of 36 mm
+NOMINAL_MM = 0.01
 
 
 @dataclass
@@ -50,6 +55,19 @@ class StatedModel:
     on_rig: dict[int, tuple[str, str]] = field(default_factory=dict)  # place and moment of photographs
     notes: list[str] = field(default_factory=list)  # on what is read but not used unchanged
     images_named: bool = True  # whether the photographs have names; else they are numbered
+    points_named: bool = False  # likewise for the points
+    # control and check points: coordinates (3,) and covariance (3, 3) by the index of the point
+    control: dict[int, tuple[FloatArray, FloatArray]] = field(default_factory=dict)
+    checks: dict[int, tuple[FloatArray, FloatArray]] = field(default_factory=dict)
+    bars: list[tuple[int, int, float, float]] = field(default_factory=list)  # ends, length, sigma
+    # observed poses: position (3,), omega phi kappa (3,), covariance (6, 6) by the index of the photograph
+    exterior: dict[int, tuple[FloatArray, FloatArray, FloatArray]] = field(default_factory=dict)
+    # of all points and image points, or empty; NaN where a point has none
+    point_sigma: array[float] = field(default_factory=lambda: array("d"))  # of X, Y, Z one after another
+    xy_sigma: array[float] = field(default_factory=lambda: array("d"))  # of x, y one after another, px
+    used: list[bool] = field(default_factory=list)  # whether each image point took part; all if empty
+    unit: str = ""  # object unit; empty where unknown
+    crs: str = ""  # coordinate system of the object in well-known text; empty where unknown
     text: Lines | None = None  # the lines being read, for the place of an error
 
     def error(self, message: str) -> SurveyFileError:
@@ -123,7 +141,7 @@ class StatedModel:
 
 
 def content_of(stated: StatedModel) -> Content:
-    """Return a stated model as a survey; points are uncoded, since these programs number them.
+    """Return a stated model as a survey; points that its program only numbers are uncoded.
 
     The same point twice in one photograph is read once, as the first of both, and noted. Places that share
     photographs of one moment make a rig. A camera at several places becomes one at each, with the same
@@ -149,15 +167,31 @@ def content_of(stated: StatedModel) -> Content:
             f"{counted(len(image) - len(first), 'image point')} of points that their photograph shows twice "
             "left out"
         )
-    k = len(first)
-    seen = ImagePoints(
-        image[first],
-        point[first],
-        np.array(stated.xy, dtype=float).reshape(-1, 2)[first],
-        np.tile(np.eye(2), (k, 1, 1)),
-        np.zeros(k, dtype=bool),
+    xy = np.array(stated.xy, dtype=float).reshape(-1, 2)
+    sigma = (
+        np.array(stated.xy_sigma, dtype=float).reshape(-1, 2) if stated.xy_sigma else np.ones((len(xy), 2))
     )
-    network = Network(images, np.array(stated.camera, dtype=np.int64), tuple(stated.points), seen)
+    seen = ImagePoints(
+        image, point, xy, np.eye(2) * sigma[:, None] ** 2, np.full(len(xy), bool(stated.xy_sigma))
+    )
+    used = np.array(stated.used or [True] * len(xy), dtype=bool)[first]
+    images_given, poses = list(stated.exterior), list(stated.exterior.values())
+    bars = np.array(stated.bars, dtype=float).reshape(-1, 4)
+    network = Network(
+        images,
+        np.array(stated.camera, dtype=np.int64),
+        tuple(stated.points),
+        seen.select(first[used]),
+    ).with_given(
+        object_points(stated.control),
+        ExteriorObservations(
+            np.array(images_given, dtype=np.int64),
+            np.array([position for position, _, _ in poses], dtype=float).reshape(-1, 3),
+            np.array([angles for _, angles, _ in poses], dtype=float).reshape(-1, 3),
+            np.array([C for _, _, C in poses], dtype=float).reshape(-1, 6, 6),
+        ),
+        ScaleBars(bars[:, 0].astype(np.int64), bars[:, 1].astype(np.int64), bars[:, 2], bars[:, 3]),
+    )
     estimate = Estimate(
         tuple(stated.cameras),
         np.array(stated.position, dtype=float).reshape(-1, 3),
@@ -165,10 +199,23 @@ def content_of(stated: StatedModel) -> Content:
         np.array(stated.xyz, dtype=float).reshape(-1, 3),
     )
     network, estimate = _with_rigs(stated, network, estimate)
+    variance = np.array(stated.point_sigma, dtype=float).reshape(-1, 1, 3) ** 2
     solution = Solution(
-        stated.path.name, network, estimate, points_named=False, images_named=stated.images_named
+        stated.path.name,
+        network,
+        estimate,
+        np.where(np.eye(3, dtype=bool), variance, 0.0) if np.isfinite(variance).any() else None,
+        unit=stated.unit,
+        points_named=stated.points_named,
+        images_named=stated.images_named,
     )
-    return Content(solution, notes=tuple(notes))
+    return Content(
+        solution,
+        rejected=seen.select(first[~used]),
+        checks=object_points(stated.checks),
+        notes=tuple(notes),
+        crs=stated.crs,
+    )
 
 
 def _with_rigs(stated: StatedModel, network: Network, estimate: Estimate) -> tuple[Network, Estimate]:
@@ -299,6 +346,43 @@ def from_vision_axes(R: FloatArray) -> FloatArray:
 def to_vision_axes(rotation: FloatArray) -> FloatArray:
     """Return the inverse of `from_vision_axes`, (..., 3, 3)."""
     return np.asarray(VISION_AXES @ np.swapaxes(rotation, -1, -2))
+
+
+def rotation_from_heading(heading: float, pitch: float, roll: float) -> FloatArray:
+    """Return R = Rz(-heading) Rx(pitch) Ry(roll), image axes to object axes, (3, 3).
+
+    With angles of 0 the camera looks down with north at the top; the heading, also called yaw, is clockwise.
+
+    Args:
+        heading: angle, degrees.
+        pitch: angle, degrees.
+        roll: angle, degrees.
+    """
+    return np.asarray(Rotation.from_euler("ZXY", [-heading, pitch, roll], degrees=True).as_matrix())
+
+
+def heading_from_rotation(rotation: FloatArray) -> FloatArray:
+    """Return heading, pitch and roll of `rotation_from_heading`, degrees, (..., 3).
+
+    At a pitch of +-90 degrees heading and roll are not separable, and roll is 0.
+
+    Args:
+        rotation: image axes to object axes, (..., 3, 3).
+    """
+    R = np.asarray(rotation, dtype=float)
+    across = np.hypot(R[..., 2, 0], R[..., 2, 2])
+    level = across > 1e-12  # rounding of a rotation below it
+    heading = np.where(level, np.arctan2(R[..., 0, 1], R[..., 1, 1]), -np.arctan2(R[..., 1, 0], R[..., 0, 0]))
+    roll = np.where(level, np.arctan2(-R[..., 2, 0], R[..., 2, 2]), 0.0)
+    return np.asarray(np.degrees(np.stack([heading, np.arctan2(R[..., 2, 1], across), roll], axis=-1)))
+
+
+def unstated_camera(stated: StatedModel) -> Camera:
+    """Return the camera that stands for one that a file does not state, and note it."""
+    stated.notes.append(
+        "cameras are not stated: one of c 36 mm with photographs of 36 mm x 36 mm stands for them"
+    )
+    return camera_from_values(UNSTATED, "brown_forward", NOMINAL_PX, (NOMINAL_MM, NOMINAL_MM), c_mm=36.0)
 
 
 def numbers_of_slots(index: IntArray) -> IntArray:

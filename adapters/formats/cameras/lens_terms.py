@@ -7,6 +7,8 @@
 Four coefficients are model `opencv`, five or eight `full_opencv`; a fifth of 0 is `opencv` too. Thin prisms
 (s) and tilted sensors (tau) are no part of these models and are refused unless they are 0.
 
+Programs that distort the ideal point with polynomials of their own make `brown_forward`, in `forward_camera`.
+
 Source: OpenCV 4 documentation, "Camera Calibration and 3D Reconstruction" and "Fisheye camera model".
 """
 
@@ -19,7 +21,7 @@ from scipy.spatial.transform import Rotation
 
 from adapters.colmap.reconstruction import as_opencv
 from sfm.files.plain_text import shorten
-from sfm.model.camera import Camera
+from sfm.model.camera import Camera, camera_from_values
 from sfm.model.conventions import VISION_AXES, FloatArray
 from sfm.model.distortion.models import MODELS
 from sfm.model.errors import SurveyFileError
@@ -27,6 +29,7 @@ from sfm.model.estimate import Mounts
 
 COUNTS = (0, 4, 5, 8, 12, 14)  # of coefficients
 FULL = MODELS["full_opencv"].names[4:]  # k1, k2, p1, p2, k3, k4, k5, k6
+FORWARD = MODELS["brown_forward"].names[3:]  # K1 to K4, P1, P2, b1, b2
 LEAN = ("k4", "k5", "k6")  # held at 0 for five coefficients
 
 
@@ -89,6 +92,36 @@ def camera_of_matrix(
     D = np.concatenate([D, np.zeros(8)])[:8]
     model = "full_opencv" if D[4:].any() else "opencv"
     return camera_in_pixels(where, name, model, size_px, np.concatenate([plane, D if D[4:].any() else D[:4]]))
+
+
+def forward_camera(
+    name: str,
+    size_px: tuple[int, int],
+    pixel_mm: tuple[float, float],
+    plane: tuple[float, float, float],
+    terms: tuple[float, ...],
+    *,
+    scale: float = 1.0,
+) -> Camera:
+    """Return the camera in model brown_forward of a polynomial with a linear term.
+
+    With X = c u, Y = c v and r2 = X2 + Y2 the distorted point is x0 + X (s + K1 r2 + ... + K4 r8) + b1 X +
+    b2 Y + P1 (r2 + 2 X2) + 2 P2 X Y, and likewise y; s goes into the principal distance.
+
+    Args:
+        name: name of the camera.
+        size_px: width and height of its photographs, px.
+        pixel_mm: width and height of a pixel, mm.
+        plane: c, x0 and y0, mm.
+        terms: K1, K2, K3, K4, P1, P2, b1, b2, in powers of mm.
+        scale: s, positive.
+    """
+    power = (3, 5, 7, 9, 2, 2, 1, 1)
+    values = {f: value / scale**n for f, value, n in zip(FORWARD, terms, power, strict=True)}
+    values |= {"x0": plane[1], "y0": plane[2]}
+    return camera_from_values(
+        name, "brown_forward", size_px, pixel_mm, c_mm=scale * plane[0], values=tuple(values.items())
+    )
 
 
 def matrix_of(camera: Camera) -> FloatArray:

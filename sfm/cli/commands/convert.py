@@ -8,9 +8,12 @@ from typing import Annotated
 
 import typer
 
+from sfm.cli.options import Verbose
 from sfm.cli.process import loading
 from sfm.model.errors import SurveyFileError
 from sfm.runtime.faults import working_on
+
+MOST_LINES = 3  # on what a conversion loses
 
 
 def convert(
@@ -22,7 +25,8 @@ def convert(
             "--to",
             metavar="F",
             help="Format to write.  [default: by the ending of OUT: .xml metashape, .ply ply, .laz and "
-            ".las laz, .e57 e57, .db colmap-database, .nvm nvm, .sfm alicevision, none tables]",
+            ".las laz, .e57 e57, .csv points-csv, .geojson geojson, .db colmap-database, .nvm nvm, .sfm "
+            "alicevision, none tables]",
         ),
     ] = None,
     from_format: Annotated[
@@ -41,6 +45,15 @@ def convert(
             "--control", metavar="FILE", help="Control points of a PhotoModeler export: id,label,X,Y,Z..."
         ),
     ] = None,
+    crs: Annotated[
+        str | None,
+        typer.Option(
+            "--crs",
+            metavar="EPSG:N",
+            help="For formats of points: coordinate system to write; points of a known one are transformed.",
+        ),
+    ] = None,
+    verbose: Verbose = False,
     camera: Annotated[
         str | None,
         typer.Option("--camera", metavar="NAME", help="For formats of cameras: the only camera to write."),
@@ -54,9 +67,10 @@ def convert(
 
     A camera whose model the format lacks is converted to one that it has. Formats of surveys: colmap,
     colmap-text, colmap-database, tables, metashape, photomodeler, opensfm (also projects of OpenDroneMap),
-    openmvg, alicevision (Meshroom), nerfstudio, bundler, nvm (VisualSFM), bal, sba, bundle-matlab,
-    bundle-csharp, rig (calibration files of rigs for OpenCV, COLMAP, DICe, MatchID, Kalibr, ROS and mrcal),
-    ply, and the point clouds laz and e57.
+    openmvg, alicevision (Meshroom), nerfstudio, bundler, nvm (VisualSFM), micmac, aicon (also of JAG3D),
+    realitycapture (CSV), agisoft-reference (CSV), bal, sba, bundle-matlab, bundle-csharp, rig (calibration
+    files of rigs for OpenCV, COLMAP, DICe, MatchID, Kalibr, ROS and mrcal), and those of points alone: laz,
+    e57, points-csv, geojson and ply.
 
     Formats of cameras, to read and write: opencv-camera, ros-camera, kalibr-camera, mrcal-camera,
     colmap-camera, metashape-camera, australis-camera, nerfstudio-camera and blender-camera. A camera of a
@@ -65,6 +79,7 @@ def convert(
     with loading():
         from adapters.formats.cameras.registry import NAMES, camera_format_of
         from adapters.formats.content import with_cameras
+        from adapters.formats.point_tables import in_system
         from adapters.formats.registry import (
             ENDINGS,
             FORMATS,
@@ -102,8 +117,15 @@ def convert(
         raise SurveyFileError(
             f"{source}: a file of cameras, without a survey; --to needs one of {', '.join(NAMES)}"
         )
+    if crs is not None and not form.only_points:
+        raise SurveyFileError(
+            f"--crs: format {form.name} has photographs; only formats of points are transformed"
+        )
     with working_on(str(source)):
         content = read_content(source, from_format, control=control)
+    whole = content
+    if crs is not None:
+        content = in_system(content, crs)
     network, estimate = content.result.network, content.result.estimate
     cameras = estimate.cameras
     conversions: tuple[Conversion, ...] = ()
@@ -132,5 +154,9 @@ def convert(
     for note in content.notes:
         print(f"{source}: {note}")
     print(f"{target}: {describe_stored(form.name, network, estimate)} as {form.name}")
-    for loss in losses_in_words(form.name, content, gone):
-        print(f"{target}: {loss} left out, format {form.name} cannot store them")
+    lost = losses_in_words(form.name, replace(whole, crs=content.crs), gone)
+    told = len(lost) if verbose or len(lost) <= MOST_LINES else MOST_LINES - 1
+    for loss in lost[:told]:
+        print(f"{target}: {loss} left out, they are not written as {form.name}")
+    if lost[told:]:
+        print(f"{target}: {', '.join(lost[told:])} likewise; -v prints a line for each")
