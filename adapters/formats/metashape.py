@@ -63,8 +63,6 @@ def read_metashape(path: Path) -> tuple[Network, Estimate]:
     root = read_xml(path, markers.taken())
     chunk = root if root.tag == "chunk" else root.one("chunk")
     sensors = chunk.one("sensors").all("sensor")
-    if not sensors:
-        raise chunk.error("no sensors")
     cameras = tuple(_camera(sensor) for sensor in sensors)
     sensor_index = {sensor.name("id"): k for k, sensor in enumerate(sensors)}
     object_from_chunk = _chunk_transform(chunk)
@@ -73,6 +71,8 @@ def read_metashape(path: Path) -> tuple[Network, Estimate]:
         for group in (chunk.one("cameras"), *chunk.one("cameras").all("group"))
         for node in group.all("camera")
     ]
+    if nodes and not sensors:
+        raise chunk.error("no sensors")
     images = {node.name("id"): i for i, node in enumerate(nodes)}
     m = len(nodes)
     position, rotation = np.full((m, 3), np.nan), np.full((m, 3, 3), np.nan)

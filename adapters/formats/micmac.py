@@ -15,8 +15,8 @@ This is `brown_forward` where CDist is PP, up to R9. Otherwise the best `brown_f
 photograph is read, and its misfit noted. Pixels are taken to count from the centre of the first. Tie points
 (Homol) and MicMac v2 are not read.
 
-Source: MicMac (CeCILL-B) and the reader of its cameras in iTowns (photogrammetric-camera, MIT). The points that
-MicMac's orientation files state for verification agree with these formulas to 1e-12 px, radial and Fraser.
+Source: MicMac (CeCILL-B) and the reader of its cameras in iTowns (photogrammetric-camera, MIT). The points
+that its orientations state for verification agree with these formulas to 1e-12 px.
 """
 
 from __future__ import annotations

@@ -9,8 +9,8 @@ right, y down. Later versions name them f_35mm, px_norm and py_norm. With a = x 
 
 This is `brown_forward`. The file has neither the sizes of the photographs nor points.
 
-Source: nerfstudio (realitycapture_utils) for angles, f, px and py; AliceVision (importKnownPoses) for t1 and t2,
-which nerfstudio exchanges.
+Source: nerfstudio (realitycapture_utils) for angles, f, px and py; AliceVision (importKnownPoses) for t1 and
+t2, which nerfstudio exchanges.
 """
 
 from __future__ import annotations

@@ -37,7 +37,7 @@ from adapters.formats.bundle_text import (
 from adapters.formats.bundler import PLACES as BUNDLER_PLACES
 from adapters.formats.bundler import read_bundler, write_bundler
 from adapters.formats.cameras.rig_folder import write_rig_files
-from adapters.formats.content import ALL, Content, losses, refuse_not_finite, select_placed
+from adapters.formats.content import ALL, UNSTATED, Content, losses, refuse_not_finite, select_placed
 from adapters.formats.e57 import HEAD as E57_HEAD
 from adapters.formats.e57 import read_e57, write_e57
 from adapters.formats.las import HEAD as LAS_HEAD
@@ -112,6 +112,10 @@ class FileFormat:
     adjusts: bool = False  # whether it is the input of an adjustment with the standard deviations in it
     recognises: Callable[[str], bool] = lambda head: False  # whether a file is of it, by its beginning
     marks: tuple[str, ...] = ()  # patterns of files in a folder of it, of which one is enough
+    needs: str = (
+        ""  # the kind of content without which a survey cannot be stored; a problem of adjustment does
+    )
+    of_photographs: bool = False  # whether it has the cameras of photographs only
     flat: bool = False  # whether its names of photographs have no folders
     keeps_also: Callable[[Content], frozenset[str]] = lambda content: (
         frozenset()
@@ -212,6 +216,7 @@ FORMATS = (
     FileFormat(
         name="photomodeler",
         models=PHOTOMODELER_MODELS,
+        needs="image points",
         read_all=read_export,
         write_all=write_export,
         keeps=(_NAMED - {"uncoded"}) | {"control", "point sigmas", "position sigmas", "image sigmas"},
@@ -223,6 +228,7 @@ FORMATS = (
     FileFormat(
         name="bal",
         models=("opencv", "radial"),
+        needs="image points",
         read=read_bal,
         write=write_bal,
         keeps=_SOLVED,
@@ -234,6 +240,7 @@ FORMATS = (
     FileFormat(
         name="bundle-csharp",
         models=("brown",),
+        needs="image points",
         read=read_bundle_csharp,
         write=write_bundle_csharp,
         keeps=_NAMED | {"image sigmas"},
@@ -243,6 +250,7 @@ FORMATS = (
     FileFormat(
         name="bundle-matlab",
         models=("brown",),
+        needs="image points",
         read=read_bundle_matlab_folder,
         write=write_bundle_matlab_folder,
         keeps=_SOLVED | {"image names", "image sigmas"},
@@ -254,6 +262,7 @@ FORMATS = (
     FileFormat(
         name="sba",
         models=("opencv",),
+        needs="image points",
         read=read_sba,
         write=write_sba_folder,
         keeps=_SOLVED | {"image sigmas", "image covariances"},
@@ -289,6 +298,7 @@ FORMATS = (
     FileFormat(
         name="bundler",
         models=("radial",),
+        of_photographs=True,
         read_all=read_bundler,
         write_all=write_bundler,
         keeps=_SOLVED | {"image names"},
@@ -301,6 +311,7 @@ FORMATS = (
     FileFormat(
         name="nvm",
         models=("brown",),
+        of_photographs=True,
         read_all=read_nvm,
         write_all=write_nvm,
         keeps=_SOLVED | {"image names"},
@@ -362,6 +373,7 @@ FORMATS = (
     FileFormat(
         name="realitycapture",
         models=("brown_forward",),
+        of_photographs=True,
         read_all=read_realitycapture,
         write_all=write_realitycapture,
         keeps=frozenset({"cameras", "exterior orientations", "image names"}),
@@ -618,6 +630,7 @@ def write_content(path: Path, name: str, content: Content) -> None:
     _refuse_cameras(form, estimate.cameras)
     if form.placed:
         _refuse_unplaced(path, form, content)
+    _refuse_empty(path, form, content)
     with whole_folder(path) if form.folder else nullcontext(path) as target:
         if form.write_all is not None:
             form.write_all(target, content)
@@ -637,6 +650,27 @@ def _refuse_unplaced(path: Path, form: FileFormat, content: Content) -> None:
         raise OutputError(
             f"{path}: format {form.name} needs coordinates in the object, but no photograph and no point has "
             "coordinates"
+        )
+
+
+def _refuse_empty(path: Path, form: FileFormat, content: Content) -> None:
+    """Raise OutputError if a format stores nothing of a survey, rather than write a file without anything."""
+    network, estimate = content.result.network, content.result.estimate
+    parts = {
+        "cameras": any(camera.name != UNSTATED for camera in estimate.cameras),
+        "exterior orientations": bool(estimate.oriented.any()),
+        "object points": bool(estimate.determined.any()),
+        "image points": len(network.image_points) > 0,
+        "control": len(network.control.complete) > 0,
+    }
+    if form.needs and not parts[form.needs]:
+        raise OutputError(f"{path}: format {form.name} stores no survey without {form.needs}")
+    alone = {"cameras"} if form.of_photographs and not parts["exterior orientations"] else set()
+    if not any(there and kind in form.keeps - alone for kind, there in parts.items()):
+        there = [kind for kind, present in parts.items() if present] or ["nothing"]
+        raise OutputError(
+            f"{path}: format {form.name} stores nothing of this survey, in which there is "
+            f"{' and '.join(there)} only"
         )
 
 

@@ -367,7 +367,7 @@ class _Summary(Json):
     length_unit: Text | None = None
     datum: _DatumEntry | None = None
     redundancy: Annotated[int, Field(ge=0, strict=True)] | None = None
-    cameras: Annotated[tuple[_CameraEntry, ...], Field(min_length=1)]
+    cameras: tuple[_CameraEntry, ...]  # none of points alone
     sources: tuple[_SourceEntry, ...] = ()
     verdict: _VerdictEntry | None = None
 
@@ -379,7 +379,7 @@ def _cameras(folder: Path, summary: _Summary) -> tuple[tuple[Camera, ...], tuple
     table.refuse(sigma, sigma < 0, ("sigma",), "0 or more, or nothing")
     keys = tuple(zip(*table.texts, strict=True))
     table.refuse_duplicates(keys, ("camera", "parameter"))
-    positive = np.array([name in PRINCIPAL_DISTANCES for name in table.texts[1]])
+    positive = np.array([name in PRINCIPAL_DISTANCES for name in table.texts[1]], dtype=bool)
     table.refuse(values[:, None], (positive & (values <= 0))[:, None], ("value",), "a positive c, fx or fy")
     rows = {key: k for k, key in enumerate(keys)}
     table.places("camera", [camera.name for camera in summary.cameras], "summary.json")

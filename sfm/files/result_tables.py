@@ -157,7 +157,12 @@ IMAGES = ResultTable(
     may_be_empty=True,
 )
 CAMERAS = ResultTable(
-    "cameras", "name: camera parameter", "number: value", "optional: sigma", "further: unit"
+    "cameras",
+    "name: camera parameter",
+    "number: value",
+    "optional: sigma",
+    "further: unit",
+    may_be_empty=True,
 )
 IMAGE_POINTS = ResultTable(
     "image_points",

@@ -159,4 +159,4 @@ def convert(
     for loss in lost[:told]:
         print(f"{target}: {loss} left out, they are not written as {form.name}")
     if lost[told:]:
-        print(f"{target}: {', '.join(lost[told:])} likewise; -v prints a line for each")
+        print(f"{target}: also left out, a line for each with -v: {', '.join(lost[told:])}")

@@ -35,7 +35,8 @@ OPENCV = (
     *("colmap", "colmap-text", "colmap-database", "metashape", "bal", "sba", "rig"),
     *("opensfm", "nerfstudio", "alicevision"),
 )
-MODEL_OF = dict.fromkeys(OPENCV, "opencv") | {"bundler": "radial", "openmvg": "brown_forward"}
+MODEL_OF = dict.fromkeys(OPENCV, "opencv") | {"bundler": "radial"}
+MODEL_OF |= dict.fromkeys(("openmvg", "micmac", "aicon", "realitycapture"), "brown_forward")
 
 
 def _content(model: str, *, calibrated: bool = False) -> Content:

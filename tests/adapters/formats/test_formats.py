@@ -503,12 +503,16 @@ def test_formats_are_recognised_and_go_round_by_name(name: str, tmp_path: Path) 
     if name == "bal":  # one focal length, no decentring
         network, truth = network_in("opencv", values=(("k1", -0.08), ("k2", 0.04)))
     form = format_named(name)
-    estimate, conversions = convert_cameras(truth, form.models, held=form.lacks)
+    estimate, conversions = truth, ()
+    if form.models:
+        estimate, conversions = convert_cameras(truth, form.models, held=form.lacks)
+    if name == "micmac":  # it has the coordinates of control only
+        network = network.with_control(network.points, truth.points)
     path = tmp_path / "out"
     write_any(path, name, spaceless(network), estimate)
     assert format_of(path.rename(tmp_path / "x.xml") if name == "metashape" else path).name == name
     again, read = read_any(tmp_path / "x.xml" if name == "metashape" else path)
-    if name == "nerfstudio":  # poses and cameras, without image points
+    if "image points" not in form.keeps:
         np.testing.assert_allclose(read.position, truth.position, atol=1e-12)
         return
     a, b = by_position(network), by_position(again)
