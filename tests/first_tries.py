@@ -120,6 +120,13 @@ def _unit(folder: Path) -> tuple[str, ...]:
     return "adjust", str(path)
 
 
+def _poses(folder: Path) -> Path:
+    """Write poses as RealityCapture does."""
+    path = folder / "poses.csv"
+    path.write_text("#name,x,y,alt,heading,pitch,roll,f,px,py\na.jpg,1,2,3,0,90,0,24,0,0\n", encoding="utf-8")
+    return path
+
+
 TRIES = (
     Try(
         "nothing said of the camera", "[[camera]] without free, c_mm 7 % wrong",
@@ -168,6 +175,18 @@ TRIES = (
         "an unknown ending", "kolinear convert SURVEY x.dxf",
         lambda folder: ("convert", str(folder), str(folder / "x.dxf")), 2,
         ("unknown ending .dxf, expected .xml, .ply, .laz",),
+    ),
+    Try(
+        "poses to a format of points", "kolinear convert poses.csv points.csv",
+        lambda folder: ("convert", str(_poses(folder)), str(folder / "points.csv")), 2,
+        ("format points-csv needs coordinates in the object, but no point has",),
+    ),
+    Try(
+        "a coordinate system of photographs", "kolinear convert poses.csv model --to colmap --crs EPSG:25832",
+        lambda folder: (
+            "convert", str(_poses(folder)), str(folder / "m"), "--to", "colmap", "--crs", "EPSG:25832",
+        ), 2,
+        ("--crs: format colmap has photographs; only formats of points are transformed",),
     ),
     Try(
         "a distance without unit", "kolinear plan target-size --distance 3, in m",

@@ -100,6 +100,11 @@ def test_formats_of_the_page_are_those_there_are() -> None:
     assert sorted(rows) == sorted(one.name for one in FORMATS)
 
 
+def test_the_table_of_formats_is_that_of_their_registry() -> None:
+    text = page("how-to/other-programs.md")
+    assert load_page_code("format_table").with_table(text) == text
+
+
 def test_everything_that_is_written_is_explained() -> None:
     explained = set(re.findall(r"^\| `([\w.]+)/?` \|", page("reference/results.md"), re.M))
     assert explained == set(WRITTEN)

@@ -16,7 +16,7 @@ which is `brown_forward`, whose principal distance takes the terms of r0. Photog
 deviations of 0 are not known. Image points that are not active are read as rejected.
 
 Source: Luhmann, Close-Range Photogrammetry and 3D Imaging (2020), sec. 3.3; JAiCov (GPL), whose readers name
-the columns. The residuals of its example agree with these formulas to the printed digits, 3e-6 mm.
+the columns. The residuals of its example agree with these formulas to the printed digits, 5e-6 mm.
 """
 
 from __future__ import annotations

@@ -16,7 +16,7 @@ photograph is read, and its misfit noted. Pixels are taken to count from the cen
 (Homol) and MicMac v2 are not read.
 
 Source: MicMac (CeCILL-B) and the reader of its cameras in iTowns (photogrammetric-camera, MIT). The points
-that its orientations state for verification agree with these formulas to 1e-12 px.
+that its orientations state for verification agree with these formulas to 1e-11 px.
 """
 
 from __future__ import annotations
