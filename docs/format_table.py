@@ -1,4 +1,4 @@
-"""Writes the table of formats of a page from their registry: read, written, round trip, what they were tried on.
+"""Writes the table of formats of a page from their registry: read, written, round trip, what was read.
 
 python docs/format_table.py docs/how-to/other-programs.md
 """
