@@ -16,7 +16,6 @@ Source: Agisoft Metashape Professional user manual 2.x, "Reference pane"; ypr2ma
 
 from __future__ import annotations
 
-import csv
 import re
 from collections.abc import Iterator
 from pathlib import Path
@@ -145,7 +144,7 @@ def _rows(stated: StatedModel) -> Iterator[tuple[str, bool, dict[str, float]]]:
             stated.crs = "" if system.startswith("LOCAL_CS") else system
         if not line.strip() or line.startswith("# "):
             continue
-        cells = next(csv.reader([line]))
+        cells = text.cells()
         if not header:
             header = [_column(name, stated) for name in cells]
             if header[0] != "label" or len(set(header)) < len(header):

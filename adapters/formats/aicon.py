@@ -202,9 +202,13 @@ def _read_image_point(text: Lines, words: list[str], stated: StatedModel, index:
     camera = stated.cameras[stated.camera[i]]
     if not (sx > 0 and sy > 0):
         raise text.error(f"standard deviations {sx:g} and {sy:g} mm, needed positive numbers")
-    xy = np.array([x, -y]) / camera.pixel_mm + (np.array(camera.size_px) - 1) / 2
+    with np.errstate(over="ignore"):  # of pixels that are no pixels; refused below
+        xy = np.array([x, -y]) / camera.pixel_mm + (np.array(camera.size_px) - 1) / 2
+        sigma = np.array([sx, sy]) / camera.pixel_mm
     stated.add_image_point(i, j, *xy.tolist())
-    stated.xy_sigma.extend((np.array([sx, sy]) / camera.pixel_mm).tolist())
+    if not (sigma <= MAX_SIDE_PX).all():
+        raise text.error(f"standard deviations of {sigma.max():g} px, needed {MAX_SIDE_PX} at most")
+    stated.xy_sigma.extend(sigma.tolist())
     stated.used.append(text.number_of(words[9]) != 0)
 
 

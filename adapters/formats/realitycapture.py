@@ -15,7 +15,6 @@ t2, which nerfstudio exchanges.
 
 from __future__ import annotations
 
-import csv
 from pathlib import Path
 
 import numpy as np
@@ -62,7 +61,7 @@ def read_realitycapture(path: Path) -> Content:
     while (line := text.maybe_line()) is not None:
         if not line.strip():
             continue
-        cells = next(csv.reader([line]))
+        cells = text.cells()
         if len(cells) != len(header):
             raise text.error(f"{len(cells)} columns, the header has {len(header)}")
         row = dict(zip(header, cells, strict=True))

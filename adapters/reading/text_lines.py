@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import csv
 from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
@@ -111,6 +112,17 @@ class Lines:
             self.number += 1
             raise self.error(f"the file ends here, {what} was expected")
         return words
+
+    def cells(self) -> list[str]:
+        """Return the cells of the last line read, separated by commas.
+
+        Raises:
+            SurveyFileError: it is no line of a CSV table.
+        """
+        try:
+            return next(csv.reader([self.current]), [])
+        except csv.Error as error:
+            raise self.error(f"not a CSV table: {error}") from error
 
     def end(self) -> None:
         """Refuse anything that follows.

@@ -156,6 +156,7 @@ def _results(folder: Path) -> list[Seed]:
     forward = camera_from_values("camera", "brown_forward", camera.size_px, (1.0, 1.0), c_mm=2000.0)
     models = {"opensfm": camera, "nerfstudio": camera, "alicevision": camera}
     models |= {"bundler": lens, "nvm": brown, "openmvg": forward}
+    models |= dict.fromkeys(("micmac", "aicon", "realitycapture", "agisoft-reference", "points-csv"), forward)
     for form, of_form in models.items():
         write_any(folder / form, form, network, replace(truth, cameras=(of_form,)))
     write_any(folder / "scene.db", "colmap-database", network, truth)
@@ -172,6 +173,16 @@ def _results(folder: Path) -> list[Seed]:
         for name in ("cams.txt", "pts.txt", "sigmas.txt", "interior.txt")
     ]
     files += [(name, name, name) for name in ("nerfstudio", "alicevision", "nvm", "openmvg")]
+    files += [(name, name, name) for name in ("realitycapture", "points-csv")]
+    files += [
+        (f"micmac/{name}", "micmac", "micmac")
+        for name in ("AutoCal-0.xml", f"Orientation-{network.images[0]}.xml", "MesuresIm.xml")
+    ]
+    files += [(f"aicon/survey.{ending}", "aicon", "aicon") for ending in ("ior", "eor", "obc", "phc")]
+    files += [
+        (f"agisoft-reference/{name}", "agisoft-reference", "agisoft-reference")
+        for name in ("cameras.csv", "markers.csv")
+    ]
     files += [(f"opensfm/{name}", "opensfm", "opensfm") for name in ("reconstruction.json", "tracks.csv")]
     files += [(f"bundler/{name}", "bundler", "bundler") for name in ("bundle.out", "list.txt")]
     for name, whole, form in files:
