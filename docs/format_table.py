@@ -30,7 +30,7 @@ WORDS = {
     "unit": "unit",
     "crs": "coordinate system",
 }
-OF_ITSELF = ("tables", "points-csv")  # formats of Kolinear
+OF_ITSELF = ("tables", "points-csv", "resection")  # formats of Kolinear
 # formats that a file of their program was read of: in the tests, or once for its formulas
 IN_TESTS = {
     "colmap": "its models, and its own adjuster",

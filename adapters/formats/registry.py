@@ -56,6 +56,7 @@ from adapters.formats.photomodeler import read_export, write_export
 from adapters.formats.point_tables import HEAD as POINTS_HEAD
 from adapters.formats.point_tables import read_geojson, read_points_csv, write_geojson, write_points_csv
 from adapters.formats.realitycapture import read_realitycapture, write_realitycapture
+from adapters.formats.resection import read_resection
 from adapters.formats.result_tables import read_content as read_tables
 from adapters.formats.result_tables import read_result
 from adapters.formats.result_tables import write_content as write_content_tables
@@ -382,6 +383,14 @@ FORMATS = (
         square=True,
         names=(False, True),
         recognises=lambda head: head.startswith(realitycapture.HEAD),
+    ),
+    FileFormat(
+        name="resection",
+        models=(),
+        read_all=read_resection,
+        keeps=frozenset({"exterior orientations", "image names", "exterior"}),
+        names=(False, True),
+        recognises=lambda head: head.startswith("{") and '"solutions"' in head,
     ),
     FileFormat(
         name="agisoft-reference",

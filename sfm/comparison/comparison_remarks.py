@@ -15,7 +15,7 @@ from sfm.model.solution import MAX_POINTS
 
 HEADLINES: Mapping[Level, str] = {
     "good": "The points do not differ significantly.",
-    "fair": "The points were compared, and not tested.",
+    "fair": "The results were compared, and not tested.",
     "bad": "The results differ significantly.",
 }
 

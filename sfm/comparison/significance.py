@@ -234,7 +234,10 @@ def _align(
         source, target = b.estimate.points[pairs[:, 1]], a.estimate.points[pairs[:, 0]]
         what = "points" if align == "points" else "control points"
     if len(source) < 3:
-        raise GeometryError(f"comparison: {len(source)} {what} in common, alignment needs 3")
+        raise GeometryError(
+            f"comparison: {len(source)} {what} in common, alignment needs 3; "
+            "--align none compares two of one coordinate system"
+        )
     return fit_similarity(source, target, scale=scale)
 
 

@@ -230,6 +230,13 @@ def largest_difference(comparison: ResultComparison) -> str:
     return length_of(longest, comparison.unit, of_unknown=f"object units of {comparison.names[0]}")
 
 
+def largest_pose_difference(comparison: ResultComparison) -> str:
+    """Return the largest difference of a projection centre with its unit, and of a rotation."""
+    of_unknown = f"object units of {comparison.names[0]}"
+    position = length_of(_longest(comparison.position_difference), comparison.unit, of_unknown=of_unknown)
+    return f"{position} and {significant(_largest(comparison.rotation_deg))} deg"
+
+
 def _largest(values: FloatArray) -> float:
     return float(values.max()) if len(values) else math.nan
 

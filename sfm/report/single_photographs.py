@@ -161,21 +161,23 @@ def _refuse_existing(option: str, path: Path, inputs: tuple[Path, ...], heads: t
         raise OutputError(f"{option} {path}: exists and was not written by kolinear match")
 
 
-def resection_json(result: ResectionResult, c: float) -> dict[str, Any]:
+def resection_json(result: ResectionResult, c: float, photograph: str = "") -> dict[str, Any]:
     """Return the result of one method, ready for JSON.
 
     Args:
         result: result of `resection.by_method.resect`.
         c: principal distance, mm.
+        photograph: its name, if it has one.
 
     Returns:
-        method, points, solutions (best first: X0, Y0, Z0, omega_deg, phi_deg, kappa_deg, M, rms_mm) and,
-        if they apply, sigma0_mm, redundancy, dispersion (object unit and deg), history, residuals_mm,
-        line_fit, interior, rejected, trials, warning.
+        photograph, method, points, solutions (best first: X0, Y0, Z0, omega_deg, phi_deg, kappa_deg, M,
+        rms_mm) and, if they apply, sigma0_mm, redundancy, dispersion (object unit and deg), history,
+        residuals_mm, line_fit, interior, rejected, trials, warning.
     """
     unit = np.array([1, 1, 1, *[np.degrees(1.0)] * 3])
     lines = result.line_fit or ()
     known = {
+        "photograph": photograph or None,
         "method": result.method,
         "points": result.points,
         "solutions": [

@@ -68,7 +68,12 @@ def compare(
         from sfm.comparison.significance import compare_results
         from sfm.files.open_folders import refuse_foreign_folder
         from sfm.report.camera_differences import verdict_of_difference, write_picture
-        from sfm.report.differences import describe_pairing, describe_scale, largest_difference
+        from sfm.report.differences import (
+            describe_pairing,
+            describe_scale,
+            largest_difference,
+            largest_pose_difference,
+        )
         from sfm.report.pages import write_page
 
     refuse_foreign_folder(out)
@@ -97,5 +102,7 @@ def compare(
     print_verdict(verdict)
     if comparison.points:
         print(f"largest difference of a point: {largest_difference(comparison)}")
+    elif comparison.images:
+        print(f"largest difference of a photograph: {largest_pose_difference(comparison)}")
     print_page("Report", page, pdf=pdf)
     exit_by(verdict)

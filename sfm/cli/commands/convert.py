@@ -68,9 +68,9 @@ def convert(
     A camera whose model the format lacks is converted to one that it has. Formats of surveys: colmap,
     colmap-text, colmap-database, tables, metashape, photomodeler, opensfm (also projects of OpenDroneMap),
     openmvg, alicevision (Meshroom), nerfstudio, bundler, nvm (VisualSFM), micmac, aicon (also of JAG3D),
-    realitycapture (CSV), agisoft-reference (CSV), bal, sba, bundle-matlab, bundle-csharp, rig (calibration
-    files of rigs for OpenCV, COLMAP, DICe, MatchID, Kalibr, ROS and mrcal), and those of points alone: laz,
-    e57, points-csv, geojson and ply.
+    realitycapture (CSV), agisoft-reference (CSV), resection (of resect --json, only read), bal, sba,
+    bundle-matlab, bundle-csharp, rig (calibration files of rigs for OpenCV, COLMAP, DICe, MatchID, Kalibr,
+    ROS and mrcal), and those of points alone: laz, e57, points-csv, geojson and ply.
 
     Formats of cameras, to read and write: opencv-camera, ros-camera, kalibr-camera, mrcal-camera,
     colmap-camera, metashape-camera, australis-camera, nerfstudio-camera and blender-camera. A camera of a

@@ -49,11 +49,17 @@ def resect(
             help="Distortion of the camera file is subtracted from measured coordinates, not added.",
         ),
     ] = False,
+    photograph: Annotated[
+        str | None,
+        typer.Option(
+            "--photograph", metavar="NAME", help="Name of the photograph.  [default: that of POINTS.csv]"
+        ),
+    ] = None,
     as_json: AsJson = False,
 ) -> None:
     """Orient one photograph from known points (space resection).
 
-    Uses one method, or all methods for a comparison.
+    Uses one method, or all methods for a comparison. What --json prints can be given to compare.
     """
     with loading():
         from sfm.cli.resection_inputs import read_tasks
@@ -77,5 +83,6 @@ def resect(
     else:
         result = resect_by(task, method)
         result = replace(result, warning="; ".join(filter(None, (result.warning, warning))))
-        text, values = resection_text(result, task.c), resection_json(result, task.c)
+        text = resection_text(result, task.c)
+        values = resection_json(result, task.c, photograph or points.stem)
     print(json.dumps(values, indent=2, allow_nan=False) if as_json else text)
