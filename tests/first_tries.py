@@ -122,7 +122,8 @@ def _unit(folder: Path) -> tuple[str, ...]:
 
 def _poses(folder: Path) -> Path:
     """Write poses as RealityCapture does."""
-    path = folder / "poses.csv"
+    path = folder / "s" / "poses.csv"
+    path.parent.mkdir()
     path.write_text("#name,x,y,alt,heading,pitch,roll,f,px,py\na.jpg,1,2,3,0,90,0,24,0,0\n", encoding="utf-8")
     return path
 
