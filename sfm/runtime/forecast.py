@@ -19,7 +19,9 @@ from sfm.model.errors import OutputError
 
 KEPT_RUNS = 200
 OTHERS_APART = math.log(8.0)  # a run of the user is preferred to a typical one eight times nearer in size
-TRUSTED_SHARE = 0.1  # of the parts of a stage, from which they tell its time
+# Relative standard deviation of an expected time, and by how many parts the finished ones misstate how far a
+# stage is, as others are in work: runs of one kind and two threads (estimates).
+EXPECTED_SIGMA, PARTS_SIGMA = 0.3, 0.7
 STORED_SHARE = 0.2  # of its expected time, below which a stage read what an earlier run measured
 # How the time of a stage grows with photographs, and with the pixels of each. Tie points, windows and the
 # pictures of the report are limited in number, but sought in all pixels.
@@ -158,17 +160,21 @@ class Countdown:
         """Note the time that a stage took, s; that of a stage that comes again is added."""
         self.taken[stage] = self.taken.get(stage, 0.0) + seconds
 
-    def left(self, stage: str, elapsed: float, share: float | None = None) -> float | None:
+    def left(self, stage: str, elapsed: float, done: int = 0, parts: int = 0) -> float | None:
         """Return the time left of all stages, s; None where nothing is expected of them.
 
         Args:
             stage: the present stage.
             elapsed: time since it began, s.
-            share: finished share of all its parts, 0 to 1; None if it counts only a part of its work.
+            done: number of its parts that are finished; 0 if it counts only a part of its work.
+            parts: number of all its parts.
         """
         if not self.expected:
             return None
-        counted = elapsed / share if share is not None and share >= TRUSTED_SHARE else None
+        counted = None
+        if done:
+            weight = 1 / (1 + (PARTS_SIGMA / (EXPECTED_SIGMA * done)) ** 2)
+            counted = weight * elapsed * parts / done + (1 - weight) * self.expected.get(stage, 0.0)
         known = self.taken | ({stage: counted} if counted is not None else {})
         compared = [
             (took, self.expected[name])

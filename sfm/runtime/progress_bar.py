@@ -110,8 +110,8 @@ class _Times(ProgressColumn):
             text.append(f", about {_clock(left)} left", "progress.remaining")
         if task.stop_time is None:
             parts = task.fields["parts"]
-            share = task.completed / parts if parts and task.total == parts else None
-            of_all = self._countdown.left(task.description, task.elapsed or 0.0, share)
+            done = int(task.completed) if parts and task.total == parts else 0
+            of_all = self._countdown.left(task.description, task.elapsed or 0.0, done, parts or 0)
             if of_all is not None:
                 text.append(f", {_clock(of_all)} to the end", "progress.remaining")
         return text
