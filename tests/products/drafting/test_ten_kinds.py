@@ -212,4 +212,4 @@ def test_the_right_result_from_one_command(
         assert "walk.mp4: a video beside photographs" in told.err and "part_03.mov" not in told.err
         assert ".DS_Store" not in told.err and "._part" not in told.err + told.out
     if "turned by a program" in kind:
-        assert "unnamed-1 of 1600 x 1200 px, unnamed-2 of 1200 x 1600 px" in told.err
+        assert "unnamed-1 (6 of 1600 x 1200 px), unnamed-2 (6 of 1200 x 1600 px)" in told.err
