@@ -35,7 +35,6 @@ from sfm.files.plain_text import csv_text, shorten
 from sfm.model.conventions import METRES, FloatArray, angles_from_rotation, rotation_from_angles
 from sfm.model.errors import SurveyFileError
 from sfm.model.network import Network
-from sfm.model.observations.control_and_bars import ObjectPoints
 
 IMAGES, POINTS = "cameras.csv", "markers.csv"
 SYSTEM = "# CoordinateSystem: "
@@ -110,8 +109,10 @@ def write_reference(folder: Path, content: Content) -> None:
     if network.points:
         given: dict[int, tuple[int, FloatArray]] = {}
         for points, enabled in ((content.checks, 0), (network.control, 1)):
-            for j, cells in zip(points.point.tolist(), _points(points), strict=True):
-                given[j] = (enabled, cells)
+            variance = np.diagonal(points.covariance, axis1=1, axis2=2)
+            known = np.isfinite(variance).all(axis=1, keepdims=True)
+            cells_of = np.where(known, np.hstack([points.xyz, np.sqrt(variance)]), np.nan)
+            given |= {j: (enabled, cells) for j, cells in zip(points.point.tolist(), cells_of, strict=True)}
         rows = []
         for j, name in enumerate(network.points):
             enabled, cells = given.get(j, (0, np.full(6, np.nan)))
@@ -228,13 +229,6 @@ def _add_point(stated: StatedModel, label: str, enabled: bool, row: dict[str, fl
     if known:
         sigma = np.nan_to_num(_values(row, AXES, begin="accuracy_"))
         (stated.control if enabled else stated.checks)[j] = (xyz, np.diag(sigma**2))
-
-
-def _points(points: ObjectPoints) -> FloatArray:
-    """Return X, Y, Z and standard deviations, NaN for points with an unknown coordinate, (n, 6)."""
-    variance = np.diagonal(points.covariance, axis1=1, axis2=2)
-    rows = np.hstack([points.xyz, np.sqrt(variance)])
-    return np.asarray(np.where(np.isfinite(variance).all(axis=1, keepdims=True), rows, np.nan))
 
 
 def _observed(network: Network) -> FloatArray:

@@ -31,7 +31,6 @@ from adapters.formats.content import Content, select_placed
 from adapters.formats.stated_model import StatedModel, content_of
 from adapters.reading.text_lines import Lines, write_lines
 from sfm.files.plain_text import MAX_PIXEL_MM, MAX_SIDE_PX, shorten
-from sfm.model.camera import Camera
 from sfm.model.conventions import FloatArray, angles_from_rotation, rotation_from_angles
 from sfm.model.errors import OutputError, SurveyFileError
 
@@ -90,7 +89,18 @@ def write_aicon(folder: Path, content: Content) -> None:
                 f"{folder}: point '{shorten(name)}' of format aicon, needed a name without spaces"
             )
     folder.mkdir(parents=True, exist_ok=True)
-    cameras = [line for k, camera in enumerate(estimate.cameras, 1) for line in _camera_lines(k, camera)]
+    cameras = []
+    for k, camera in enumerate(estimate.cameras, 1):
+        p = {name: camera.value(name) for name in camera.names}
+        size = np.array(camera.size_px)
+        width, height = (size * camera.pixel_mm).tolist()
+        cameras += [
+            f"{k} -999 {-p['c']!r} {p['x0']!r} {p['y0']!r} {p['K1']!r} {p['K2']!r} 0.0",
+            f"{p['K3']!r}",
+            f"{p['P1']!r} {p['P2']!r}",
+            f"{p['b1']!r} {p['b2']!r}",
+            f"{width!r} {height!r} {size[0]} {size[1]}",
+        ]
     angles = angles_from_rotation(estimate.rotation)
     poses = [
         f"{i + 1} {network.camera[i] + 1} {_text(estimate.position[i])} {_text(angles[i])} 0 1 3"
@@ -226,19 +236,6 @@ def _read_bar(text: Lines, stated: StatedModel, points: dict[str, int]) -> None:
     if not (length > 0 and sigma > 0):
         raise text.error(f"length {length:g} and sigma {sigma:g} of a scale bar, needed positive numbers")
     stated.bars.append((points[words[0]], points[words[1]], length, sigma))
-
-
-def _camera_lines(number: int, camera: Camera) -> list[str]:
-    p = {name: camera.value(name) for name in camera.names}
-    size = np.array(camera.size_px)
-    width, height = (size * camera.pixel_mm).tolist()
-    return [
-        f"{number} -999 {-p['c']!r} {p['x0']!r} {p['y0']!r} {p['K1']!r} {p['K2']!r} 0.0",
-        f"{p['K3']!r}",
-        f"{p['P1']!r} {p['P2']!r}",
-        f"{p['b1']!r} {p['b2']!r}",
-        f"{width!r} {height!r} {size[0]} {size[1]}",
-    ]
 
 
 def _text(values: FloatArray) -> str:

@@ -33,7 +33,6 @@ from adapters.formats.stated_model import (
 from adapters.reading.text_lines import Lines
 from sfm.files.plain_text import csv_text
 from sfm.files.whole_files import whole_file
-from sfm.model.camera import Camera
 
 SIDE_MM = 36.0  # of the larger side
 POSE = ("name", "x", "y", "alt", "heading", "pitch", "roll")
@@ -75,7 +74,14 @@ def read_realitycapture(path: Path) -> Content:
                 of_row = {name: text.number_of(row[name].strip()) for name in (*PLANE, *LENS) if name in row}
                 if not of_row["f"] > 0:
                     raise text.error(f"f {of_row['f']:g} mm, it must be positive")
-                stated.cameras.append(_camera(f"camera {len(cameras)}", of_row))
+                c = of_row["f"]
+                k1, k2, k3, k4, t1, t2 = (of_row.get(term, 0.0) for term in LENS)
+                plane = (c, SIDE_MM * of_row.get("px", 0.0), -SIDE_MM * of_row.get("py", 0.0))
+                terms = (k1 / c**2, k2 / c**4, k3 / c**6, k4 / c**8, t1 / c, -t2 / c, 0.0, 0.0)
+                pixel_mm = (NOMINAL_MM, NOMINAL_MM)  # the larger side is 36 mm
+                stated.cameras.append(
+                    forward_camera(f"camera {len(cameras)}", NOMINAL_PX, pixel_mm, plane, terms)
+                )
         name = row["name"].strip()
         stated.add_image(name, cameras[lens], np.array([x, y, z]), rotation_from_heading(*angles))
     stated.text = None
@@ -96,7 +102,12 @@ def write_realitycapture(path: Path, content: Content) -> None:
     """
     result = select_placed(content).result
     network, estimate = result.network, result.estimate
-    lenses = [_lens(camera) for camera in estimate.cameras]
+    lenses = []
+    for camera in estimate.cameras:
+        side, c = max(camera.size_px) * camera.pixel_mm[0], camera.value("c")
+        plane = (SIDE_MM * c / side, camera.value("x0") / side, -camera.value("y0") / side)
+        radial = [camera.value(f"K{k}") * c ** (2 * k) for k in (1, 2, 3, 4)]
+        lenses.append(np.array([*plane, *radial, camera.value("P1") * c, -camera.value("P2") * c]).tolist())
     angles = heading_from_rotation(estimate.rotation).tolist()
     rows = [
         (name, *position, *angle, *lenses[a])
@@ -106,20 +117,3 @@ def write_realitycapture(path: Path, content: Content) -> None:
     ]
     with whole_file(path) as part:
         part.write_text("#" + csv_text((*POSE, *PLANE, *LENS), rows), encoding="utf-8", newline="")
-
-
-def _camera(name: str, row: dict[str, float]) -> Camera:
-    """Return a camera with a larger side of 36 mm."""
-    c = row["f"]
-    k1, k2, k3, k4, t1, t2 = (row.get(term, 0.0) for term in LENS)
-    plane = (c, SIDE_MM * row.get("px", 0.0), -SIDE_MM * row.get("py", 0.0))
-    terms = (k1 / c**2, k2 / c**4, k3 / c**6, k4 / c**8, t1 / c, -t2 / c, 0.0, 0.0)
-    return forward_camera(name, NOMINAL_PX, (NOMINAL_MM, NOMINAL_MM), plane, terms)
-
-
-def _lens(camera: Camera) -> list[float]:
-    """Return f, px, py, k1 to k4, t1 and t2."""
-    side, c = max(camera.size_px) * camera.pixel_mm[0], camera.value("c")
-    radial = [camera.value(f"K{k}") * c ** (2 * k) for k in (1, 2, 3, 4)]
-    plane = [SIDE_MM * c / side, camera.value("x0") / side, -camera.value("y0") / side]
-    return [float(value) for value in (*plane, *radial, camera.value("P1") * c, -camera.value("P2") * c)]
