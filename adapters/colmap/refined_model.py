@@ -18,6 +18,7 @@ from adapters.colmap.adjuster import load_pycolmap, quiet
 from adapters.colmap.camera_models import named_network, read_scene
 from adapters.colmap.reconstruction import HALF_PIXEL, camera_from_rig, camera_of, colmap_parameters
 from sfm.model.conventions import VISION_AXES, BoolArray, FloatArray, IntArray
+from sfm.model.errors import BackendError
 from sfm.model.estimate import Estimate
 from sfm.model.network import Network, rows_of
 from sfm.model.similarity import Similarity
@@ -74,6 +75,42 @@ def open_model(folder: Path) -> OpenModel:
         tuple(sorted(scene.point3D_ids())),
         np.concatenate([np.zeros(0, dtype=np.int64), *slots]),
     )
+
+
+def join_cameras_of(model: OpenModel, network: Network, estimate: Estimate, owner: IntArray) -> OpenModel:
+    """Return a model with fewer cameras, each numbered as the first of those that it replaces.
+
+    Args:
+        model: the model, without rigs.
+        network: its network with the new cameras.
+        estimate: its solution with the new cameras.
+        owner: new camera of each camera of the model, (a,).
+
+    Raises:
+        BackendError: the model has rigs.
+    """
+    if model.rigs:
+        raise BackendError("cameras of a model with rigs are not joined")
+    pycolmap = load_pycolmap()
+    first = [model.camera_ids[k] for k in np.unique(owner, return_index=True)[1].tolist()]
+    scene = pycolmap.Reconstruction()
+    with quiet(pycolmap):
+        for number, camera in zip(first, estimate.cameras, strict=True):
+            of_scene = model.scene.camera(number)
+            of_scene.params = colmap_parameters(camera)
+            scene.add_camera_with_trivial_rig(of_scene)
+        for i, a in zip(model.image_ids, network.camera.tolist(), strict=True):
+            image = model.scene.image(i)
+            copy = pycolmap.Image(
+                name=image.name, points2D=image.points2D, camera_id=first[a], image_id=image.image_id
+            )
+            if image.has_pose:
+                scene.add_image_with_trivial_frame(copy, image.cam_from_world())
+            else:
+                scene.add_image_with_trivial_frame(copy)
+        for j in model.point_ids:
+            scene.add_point3D_with_id(j, model.scene.point3D(j))
+    return replace(model, scene=scene, network=network, estimate=estimate, camera_ids=tuple(first))
 
 
 def place_model(model: OpenModel, object_from_model: Similarity) -> OpenModel:

@@ -312,13 +312,25 @@ def test_a_model_that_is_not_dependable_says_so(
     assert "error: The adjustment did not converge in " in capsys.readouterr().out
 
 
-def test_an_rms_that_is_hardly_lower_is_reported_unless_it_is_that_of_windows(tmp_path: Path) -> None:
+def test_a_model_whose_halves_are_worse_is_kept(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
     _model(tmp_path)
-    found = refine_model(*read_model(tmp_path / "model"), tmp_path)
-    again = replace(found, readjusted=found.adjustment)  # a model that has been refined before
-    assert not found.remarks and not again.remarks
-    bent = replace(again, adjustment=replace(found.adjustment, sigma0=20.0))
-    assert bent.remarks[0].kind == "refinement_hardly_better"
+    refined = refine_model(*read_model(tmp_path / "model"), tmp_path)
+    for halves in ((2e-4, 1e-4), (float("nan"), 1e-4), (1e-4, float("nan"))):
+        better = replace(refined, halves=halves)
+        assert better.better and not better.remarks
+    worse = replace(refined, halves=(1e-4, 1.1e-4))
+    assert [said.kind for said in worse.remarks] == ["refinement_not_better"]
+    differences = iter((1e-4, 1.2e-4))
+    monkeypatch.setattr("sfm.products.refining.refinement.halves_apart", lambda *_: next(differences))
+    with pytest.raises(SystemExit, match="1"):
+        refine(tmp_path / "model", tmp_path)
+    printed = capsys.readouterr().out
+    assert "100 ppm of the distance before, 120 ppm after" in printed
+    assert f"Model: {tmp_path / 'model'}\n" in printed
+    out = tmp_path / "model_refined"
+    assert (out / "refinement.html").is_file() and not list(out.glob("*.bin"))
 
 
 def test_key_points_that_are_neighbours_err_together(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -38,6 +38,10 @@ def audit(
         str,
         typer.Option("--fix", metavar="NAMES", help="Interior parameters to hold fixed, such as cx,cy,k1."),
     ] = "",
+    one_camera: Annotated[
+        bool,
+        typer.Option("--one-camera", help="Join cameras of one size and lens model into one."),
+    ] = False,
     out: Annotated[
         Path | None,
         typer.Option("--out", metavar="DIR", help="Folder of the result.  [default: out/NAME_audit]"),
@@ -62,6 +66,7 @@ def audit(
         from sfm.model.display import listed
         from sfm.pipeline import run_survey
         from sfm.products.auditing.audit import audit_of, stated_of, survey_of_model
+        from sfm.products.auditing.prepared import prepared_model
         from sfm.report.findings import findings_of
         from sfm.report.output import (
             Origin,
@@ -78,11 +83,12 @@ def audit(
     with working_on(str(model)):
         content = read_content(model, from_format)
         stated_model = replace(content.result, name=model.resolve().name)  # of "." too
+        stated_model, added = prepared_model(stated_model, one_camera=one_camera)
         stated = stated_of(stated_model)
         given = None if survey is None else read_survey(survey)
         audited, unused = survey_of_model(stated_model, stated, fixed=names_in(fix), given=given)
     left = [f"{count} {kind.words}" for kind, count in losses(content, ALL.difference(NOT_USED))]
-    notes = (*content.notes, *([f"not used of the model: {listed(left)}"] if left else []), *unused)
+    notes = (*content.notes, *added, *([f"not used of the model: {listed(left)}"] if left else []), *unused)
     folder = out or Path("out") / f"{folder_name(stated_model.name)}_audit"
     refuse_foreign_folder(folder)
     origin = Origin(model, model.parent)
@@ -100,7 +106,8 @@ def audit(
         with reporting_unfinished(folder, log, pdf=pdf):
             result = run_survey(audited, jobs=cores(), progress=log)
         findings = findings_of(result)
-        page = page_of(audit_of(stated_model, stated, findings.result, notes=notes), report="report.html")
+        judged = audit_of(stated_model, stated, findings.result, notes=notes)
+        page = page_of(judged, report="report.html")
 
         def finish(part: Path) -> None:
             for name, text in texts_of(page).items():
@@ -109,7 +116,7 @@ def audit(
 
         write_result(findings, folder, finish=finish, progress=log)
     print_verdict(page.verdict)
-    for note in notes:
+    for note in (*notes, *judged.like):
         print(f"{model}: {note}")
     print(replace(page, sections=page.sections[:SHOWN]).text)
     print_page("Report", folder / "report.html", pdf=pdf)

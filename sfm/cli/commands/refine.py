@@ -11,6 +11,8 @@ from sfm.cli.options import Pdf, names_in
 from sfm.cli.process import FAILED, compile_first, loading
 from sfm.runtime.faults import working_on
 
+PINHOLES = {"SIMPLE_PINHOLE", "PINHOLE"}  # COLMAP's models that trainers of radiance fields read
+
 
 def refine(
     model: Annotated[Path, typer.Argument(metavar="COLMAP_MODEL", help="Folder of cameras, images, points.")],
@@ -57,6 +59,10 @@ def refine(
             help="Survey file with coded targets, control and scale bars to add to the model.",
         ),
     ] = None,
+    one_camera: Annotated[
+        bool,
+        typer.Option("--one-camera", help="Join cameras of one size and lens model into one."),
+    ] = False,
     pdf: Pdf = False,
 ) -> None:
     """Remeasure the key points of a COLMAP model.
@@ -68,11 +74,15 @@ def refine(
     The principal point is also estimated if a camera took four or more photographs; hold it fixed with
     --fix cx,cy. With a survey file, the coded targets that it describes are measured and adjusted with the
     key points; its control and scale bars define the frame and scale of the model.
+
+    If halves of the points do not agree better than before, the model as it came is kept: the folder has the
+    page alone, and the exit code is 1.
     """
     with loading():
         from adapters.colmap.camera_models import write_scene
         from adapters.colmap.refined_model import (
             interior_rows,
+            join_cameras_of,
             key_points_of,
             open_model,
             place_model,
@@ -80,6 +90,7 @@ def refine(
         )
         from sfm.cli.console import print_page
         from sfm.files.whole_files import refuse_unwritable, whole_folder
+        from sfm.products.refining.joined_cameras import join_cameras
         from sfm.products.refining.oriented_windows import measure_model_targets
         from sfm.products.refining.page import Numbers, describe_key_points
         from sfm.products.refining.refinement import RefineSettings, refine_model, refinement_text
@@ -92,6 +103,8 @@ def refine(
     refuse_unwritable(out)
     with working_on(str(model)):
         opened = open_model(model)
+        if one_camera:
+            opened = join_cameras_of(opened, *join_cameras(opened.network, opened.estimate))
         given = None if survey is None else read_survey(survey)
     compile_first()
     with working_on(str(model)), drawn_progress() as progress:
@@ -127,11 +140,14 @@ def refine(
     print(refinement_text(refinement), end="")
     page = page_of(refinement, numbers=numbers, title=model.resolve().name)
     with whole_folder(out) as folder:
-        write_scene(folder, opened.scene)
+        if refinement.better:
+            write_scene(folder, opened.scene)
         for name, text in texts_of(page).items():
             (folder / name).write_text(text, encoding="utf-8")
     print(describe_key_points(refinement, numbers))
-    print(f"Model: {out}")
+    if set(opened.models) <= PINHOLES and not {"cx", "cy"} <= set(names_in(fix)):
+        print("cameras       are pinholes, of which some programs read f alone: for these add --fix cx,cy")
+    print(f"Model: {out if refinement.better else model}")
     print_page("Report", out / page.path, pdf=pdf)
-    if not refinement.dependable:
+    if not (refinement.dependable and refinement.better):
         raise SystemExit(FAILED)

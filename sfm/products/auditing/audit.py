@@ -20,12 +20,13 @@ from sfm.judgement.checks import root_mean_square
 from sfm.judgement.survey_result import SurveyResult
 from sfm.model.camera import pixel_from_rays
 from sfm.model.conventions import MAD_TO_SIGMA, METRES, FloatArray, angles_from_rotation
-from sfm.model.display import listed
+from sfm.model.display import counted, listed
 from sfm.model.errors import GeometryError
 from sfm.model.network import rows_of
 from sfm.model.similarity import fit_similarity
 from sfm.model.solution import Solution
 from sfm.products.auditing.carried import carried_of
+from sfm.products.refining.joined_cameras import LikeCameras, like_cameras
 from sfm.products.refining.refinement import free_cameras
 from sfm.survey.inputs.given_values import KnownPoints, Observations, ScaleBar, StartOrientations
 from sfm.survey.inputs.survey import Survey
@@ -85,6 +86,7 @@ class Audit:
     moved: tuple[Moved, ...]
     gauge: tuple[tuple[str, float, float], ...]  # datum, RMS of sX, sY, sZ of points and of photographs, unit
     notes: tuple[str, ...] = ()  # what reading it changed, and what of it is not used
+    like: tuple[LikeCameras, ...] = ()  # cameras that could be one
 
 
 def stated_of(model: Solution) -> Stated:
@@ -105,8 +107,12 @@ def stated_of(model: Solution) -> Stated:
     residuals = residuals[np.isfinite(residuals).all(axis=1)]
     if not len(residuals):
         raise GeometryError(
-            "audit: the model has no image points of oriented photographs and points with coordinates; "
-            "poses, cameras or points alone cannot be tested"
+            "audit: no image points of oriented photographs and of points with coordinates, or that two "
+            "photographs see: the model has "
+            f"{counted(int(estimate.oriented.sum()), 'oriented photograph')}, "
+            f"{counted(len(network.image_points), 'image point')} and "
+            f"{counted(int(estimate.determined.sum()), 'point')} with coordinates; poses, cameras or points "
+            "alone cannot be tested"
         )
     unknowns = 6 * len(np.unique(seen.image)) + 3 * len(np.unique(seen.point)) - DATUM
     return Stated(
@@ -252,7 +258,7 @@ def audit_of(model: Solution, stated: Stated, result: SurveyResult, *, notes: tu
         )
         for words, of in datums
     )
-    return Audit(model, stated, result, moved, gauge, notes)
+    return Audit(model, stated, result, moved, gauge, notes, like_cameras(a, a.false_alarm))
 
 
 def _moved(kind: str, names: Sequence[str], off: FloatArray, covariance: FloatArray) -> Moved:

@@ -149,6 +149,8 @@ def _cameras(audit: Audit) -> Iterator[Part]:
         f"Two parameters that correlate by more than {STRONG:g} are hardly told apart: only their combined "
         "effect is known as well as the residuals suggest."
     )
+    for like in audit.like:
+        yield Paragraph(f"{like}.")
     kept = [f"{name} of {counted(count, 'camera')}" for name, count in held.items() if count]
     if kept:
         yield Paragraph(

@@ -33,6 +33,9 @@ from sfm.model.estimate import Estimate
 from sfm.model.network import Network, without_given
 from sfm.model.reduced_network import check_number
 from sfm.model.remarks.remark import Remark, remark, unless_note
+from sfm.model.remarks.row import significant
+from sfm.products.refining.halves import halves_apart
+from sfm.products.refining.joined_cameras import LikeCameras, like_cameras
 from sfm.products.refining.oriented_windows import (
     ModelTargets,
     OrientedKeyPoints,
@@ -78,11 +81,6 @@ MAX_OFF_AXIS_DEG = 85.0
 MAX_SHIFT_FACTOR = 6.0
 MIN_SHIFT_PX = 2.0
 UNSUPPORTED = f"of a point that fewer than {MIN_RAYS} photographs match"
-# If the RMS after refinement is more than this fraction of the RMS before, and sigma0 is more than twice the
-# value that windows and surfaces explain, not only the key points are wrong. A model that was refined before
-# also has a similar RMS before and after.
-HARDLY_BETTER = 0.5
-MAX_SIGMA0 = 2.0
 BEYOND = f"behind the photograph or more than {MAX_OFF_AXIS_DEG:g} degrees off the axis"
 
 
@@ -106,6 +104,15 @@ class Refinement:
     reasons: tuple[tuple[str, int], ...]  # (why key points took no part, number), most frequent first
     targets: ModelTargets | None = None  # they follow the points of the model in the adjustment
     found: tuple[Remark, ...] = ()  # on targets, control and scale bars
+    halves: tuple[float, float] = (np.nan, np.nan)
+    """RMS difference of projection centres of two halves of the points, before and after, relative to the
+    distance; see `halves_apart`"""
+    like: tuple[LikeCameras, ...] = ()  # cameras that could be one
+
+    @property
+    def better(self) -> bool:
+        """Whether halves of the points differ less than before, or cannot be compared."""
+        return not self.halves[1] >= self.halves[0]
 
     @property
     def key_points(self) -> int:
@@ -151,8 +158,8 @@ class Refinement:
             remarks.append(
                 remark("rank_defect", defect=adjustment.defect, expected=adjustment.expected_defect)
             )
-        if self.after_px > HARDLY_BETTER * self.readjusted_px and adjustment.sigma0 > MAX_SIGMA0:
-            remarks.append(remark("refinement_hardly_better", times=self.after_px / self.readjusted_px))
+        if not self.better:
+            remarks.append(remark("refinement_not_better", times=self.halves[1] / self.halves[0]))
         lost = [name for name, used in zip(self.model.images, self.images, strict=True) if not used]
         if lost:
             remarks.append(remark("photographs_not_adjusted", photographs=lost))
@@ -334,6 +341,11 @@ def refine_model(
         by_count([*reasons(windows), ("contradict the others", int(rejected.sum())), (UNSUPPORTED, left)]),
         targets,
         remarks if targets is None else (*targets.remarks, *remarks),
+        halves=(
+            halves_apart(first, readjusted.estimate, ~readjusted.rejected),
+            halves_apart(final.network, final.estimate, ~final.rejected),
+        ),
+        like=like_cameras(final, settings.false_alarm),
     )
 
 
@@ -349,8 +361,21 @@ def refinement_text(result: Refinement) -> str:
         f"{result.readjusted_px:.4f} px adjusted anew\n"
         f"RMS after     {result.after_px:.4f} px\n"
         f"sigma0        {result.adjustment.sigma0_px:.4f} px (redundancy {result.adjustment.redundancy})\n"
+        + _describe_halves(result)
         + _describe_targets(result)
         + "".join(f"{said.severity}: {said.text}\n" for said in result.remarks)
+        + "".join(f"cameras       {cameras}\n" for cameras in result.like)
+    )
+
+
+def _describe_halves(result: Refinement) -> str:
+    """Return the line on halves of the points; empty if they cannot be compared."""
+    before, after = result.halves
+    if not np.isfinite(before + after):
+        return ""
+    return (
+        f"halves        of the points: projection centres differ by {significant(1e6 * before)} ppm of the "
+        f"distance before, {significant(1e6 * after)} ppm after\n"
     )
 
 

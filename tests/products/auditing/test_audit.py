@@ -11,6 +11,7 @@ import pytest
 from adapters.formats.content import Content
 from adapters.formats.registry import write_content
 from sfm.adjustment.quality.correlations import OrientationCorrelation
+from sfm.model.camera import pixel_from_rays
 from sfm.model.errors import GeometryError
 from sfm.model.estimate import Estimate
 from sfm.model.network import Network
@@ -19,6 +20,7 @@ from sfm.model.similarity import fit_similarity
 from sfm.model.solution import Solution
 from sfm.pipeline import run_survey
 from sfm.products.auditing.audit import Audit, audit_of, stated_of, survey_of_model
+from sfm.products.auditing.prepared import prepared_model
 from sfm.report.pages import html_of, page_of
 from sfm.survey.inputs.exterior_table import ObservedExterior
 from sfm.survey.inputs.given_values import ScaleBar
@@ -280,8 +282,115 @@ def test_correlated_control_of_a_model_is_kept() -> None:
 def test_poses_alone_are_refused() -> None:
     network, truth = network_of("poses")
     unseen = replace(truth, points=np.full_like(truth.points, np.nan))
-    with pytest.raises(GeometryError, match="no image points of oriented photographs"):
+    with pytest.raises(GeometryError, match="0 points with coordinates"):
         stated_of(model_of(network, unseen))
+
+
+def test_points_that_a_model_leaves_out_are_intersected() -> None:
+    """MicMac stores orientations and image points, and coordinates of control alone."""
+    network, truth = network_of("left out")
+    points = truth.points.copy()
+    points[5:] = np.nan
+    unplaced = model_of(network, replace(truth, points=points))
+    model, notes = prepared_model(unplaced, one_camera=False)
+    assert notes == (
+        "the model has no coordinates of 35 points, which were intersected from its photographs",
+    )
+    np.testing.assert_array_equal(model.estimate.points[:5], truth.points[:5])
+    np.testing.assert_allclose(model.estimate.points, truth.points, atol=0.01)
+    assert audited(model).result.verdict.level == "good"
+
+
+def test_poses_without_image_points_say_what_is_missing() -> None:
+    network, truth = network_of("nothing seen")
+    none = np.zeros(len(network.image_points), dtype=bool)
+    alone = replace(network, image_points=network.image_points.select(none))
+    model, notes = prepared_model(model_of(alone, truth), one_camera=False)
+    assert not notes
+    with pytest.raises(GeometryError, match="has 8 oriented photographs, 0 image points and 40 points with"):
+        stated_of(model)
+
+
+def as_program_reads(truth: Estimate, *, p1: float = 0.0) -> Estimate:
+    """Return cameras as they come from a format with one principal distance and k1."""
+    values = {"fy": "fx"}
+    cameras = []
+    for camera in truth.cameras:
+        of = dict(zip(camera.names, camera.parameters.tolist(), strict=True))
+        of |= {new: of[old] for new, old in values.items()} | {"k2": 0.0, "p1": p1, "p2": 0.0}
+        cameras.append(camera.with_parameters(np.array([of[name] for name in camera.names])))
+    return replace(truth, cameras=tuple(cameras))
+
+
+def test_a_camera_with_one_principal_distance_keeps_one() -> None:
+    network, truth = network_of("one focal", cameras=2)
+    model, _ = prepared_model(model_of(network, as_program_reads(truth)), one_camera=False)
+    assert [camera.model for camera in model.estimate.cameras] == ["simple_radial"] * 2
+    assert model.estimate.cameras[0].value("f") == as_program_reads(truth).cameras[0].value("fx")
+    ray = np.array([[0.2, -0.1, -1.0]])
+    for camera, before in zip(model.estimate.cameras, as_program_reads(truth).cameras, strict=True):
+        np.testing.assert_allclose(pixel_from_rays(camera, ray), pixel_from_rays(before, ray), rtol=1e-14)
+    model, _ = prepared_model(model_of(network, as_program_reads(truth, p1=1e-4)), one_camera=False)
+    assert [camera.model for camera in model.estimate.cameras] == ["opencv"] * 2
+
+
+def of_each_photograph(network: Network, truth: Estimate, spread: float = 0.0) -> Solution:
+    """Return a model with a camera for each photograph, whose principal distances differ by a part."""
+    (camera,) = truth.cameras
+    lengths = np.isin(camera.names, ("fx", "fy"))
+    factor = 1.0 + spread * np.linspace(-1, 1, len(network.images))
+    cameras = tuple(
+        replace(
+            camera,
+            name=f"{i}",
+            parameters=np.where(lengths, f * camera.parameters, camera.parameters),
+        )
+        for i, f in enumerate(factor)
+    )
+    single = replace(network, camera=np.arange(len(network.images)))
+    return model_of(single, replace(truth, cameras=cameras))
+
+
+def test_cameras_that_could_be_one_are_named_and_joined() -> None:
+    """A camera for each photograph, as programs make them without EXIF."""
+    network, truth = network_of("a camera each")
+    model = of_each_photograph(network, truth)
+    audit = audited(model)
+    (like,) = audit.like
+    assert len(like.names) == 8 and like.statistic < like.limit and "could be one" in f"{like}"
+    assert "--one-camera joins" in html_of(audit, report="report.html")
+    joined, notes = prepared_model(of_each_photograph(network, truth, 0.01), one_camera=True)
+    assert notes == ("8 cameras joined into 1, as --one-camera asks",)
+    (camera,) = joined.estimate.cameras
+    assert camera.value("fx") == pytest.approx(truth.cameras[0].value("fx"), rel=1e-12)
+    one = audited(joined)
+    assert not one.like and len(one.result.adjustment.estimate.cameras) == 1
+    sigma = [np.sqrt(np.diagonal(C))[0] for C in audit.result.adjustment.covariance.interior]
+    assert np.sqrt(np.diagonal(one.result.adjustment.covariance.interior[0]))[0] < 0.5 * np.median(sigma)
+    with pytest.raises(GeometryError, match="1 camera, of which no two have the same size"):
+        prepared_model(joined, one_camera=True)
+
+
+def test_cameras_that_differ_are_not_called_one() -> None:
+    """A zoom of 2 % from the first photographs to the others."""
+    network, truth = network_of("two zooms", cameras=2)
+    first, second = truth.cameras
+    zoomed = np.where(np.isin(first.names, ("fx", "fy")), 1.02 * first.parameters, first.parameters)
+    rays = np.einsum(
+        "ki,kij->kj",
+        (truth.points[network.image_points.point] - truth.position[network.image_points.image]),
+        truth.rotation[network.image_points.image],
+    )
+    cameras = (first, replace(first, name=second.name, parameters=zoomed))
+    xy = network.image_points.xy.copy()
+    for k, camera in enumerate(cameras):
+        rows = network.camera[network.image_points.image] == k
+        xy[rows] = pixel_from_rays(camera, rays[rows])
+    xy += NOISE_PX * seed_of("zoom noise").standard_normal(xy.shape)
+    seen = replace(network.image_points, xy=xy)
+    audit = audited(model_of(replace(network, image_points=seen), replace(truth, cameras=cameras)))
+    (like,) = audit.like
+    assert like.statistic > like.limit and "differ more than one camera would" in f"{like}"
 
 
 def test_the_command_writes_page_and_report(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:

@@ -30,11 +30,13 @@ OTHER_PROGRAMS = (
 )
 REFINING = (
     Kind(
-        "refinement_hardly_better",
-        "warning",
-        "The RMS is {times} times that before; far less was expected.",
-        "a camera model that does not suit the lens, something that moved, or little texture",
-        "Use another camera model; mask what moved.",
+        "refinement_not_better",
+        "error",
+        "Halves of the points differ {times} times as much as those of the model as it came, which is kept.",
+        "a model that was refined before, a camera model that does not suit the lens, something that moved, "
+        "blurred photographs",
+        "Use the model as it came; or another camera model, photographs of their original size, or masks for "
+        "what moved.",
     ),
     Kind(
         "photographs_not_adjusted",
