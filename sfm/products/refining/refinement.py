@@ -352,6 +352,13 @@ def refine_model(
 def refinement_text(result: Refinement) -> str:
     """Return the lines that the command line prints."""
     why = describe_reasons(result.reasons)
+    before, after = result.halves
+    halves = ""  # where they cannot be compared
+    if np.isfinite(before + after):
+        halves = (
+            "halves        of the points: projection centres differ by "
+            f"{significant(1e6 * before)} ppm of the distance before, {significant(1e6 * after)} ppm after\n"
+        )
     return (
         f"key points    {result.refined} of {result.key_points} measured anew"
         + (f" (not: {why})" if why else "")
@@ -361,21 +368,10 @@ def refinement_text(result: Refinement) -> str:
         f"{result.readjusted_px:.4f} px adjusted anew\n"
         f"RMS after     {result.after_px:.4f} px\n"
         f"sigma0        {result.adjustment.sigma0_px:.4f} px (redundancy {result.adjustment.redundancy})\n"
-        + _describe_halves(result)
+        + halves
         + _describe_targets(result)
         + "".join(f"{said.severity}: {said.text}\n" for said in result.remarks)
         + "".join(f"cameras       {cameras}\n" for cameras in result.like)
-    )
-
-
-def _describe_halves(result: Refinement) -> str:
-    """Return the line on halves of the points; empty if they cannot be compared."""
-    before, after = result.halves
-    if not np.isfinite(before + after):
-        return ""
-    return (
-        f"halves        of the points: projection centres differ by {significant(1e6 * before)} ppm of the "
-        f"distance before, {significant(1e6 * after)} ppm after\n"
     )
 
 

@@ -363,10 +363,10 @@ def test_cameras_that_could_be_one_are_named_and_joined() -> None:
     assert notes == ("8 cameras joined into 1, as --one-camera asks",)
     (camera,) = joined.estimate.cameras
     assert camera.value("fx") == pytest.approx(truth.cameras[0].value("fx"), rel=1e-12)
-    one = audited(joined)
-    assert not one.like and len(one.result.adjustment.estimate.cameras) == 1
+    shared = audited(joined)
+    assert not shared.like and len(shared.result.adjustment.estimate.cameras) == 1
     sigma = [np.sqrt(np.diagonal(C))[0] for C in audit.result.adjustment.covariance.interior]
-    assert np.sqrt(np.diagonal(one.result.adjustment.covariance.interior[0]))[0] < 0.5 * np.median(sigma)
+    assert np.sqrt(np.diagonal(shared.result.adjustment.covariance.interior[0]))[0] < 0.5 * np.median(sigma)
     with pytest.raises(GeometryError, match="1 camera, of which no two have the same size"):
         prepared_model(joined, one_camera=True)
 
