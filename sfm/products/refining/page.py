@@ -167,8 +167,11 @@ def _sizes(refinement: Refinement, numbers: Numbers, unit: str) -> list[tuple[ob
     for adjusted in adjustments:
         C, correlation = adjusted.covariance, adjusted.error_correlation
         parts = (C.exterior[:, :3, :3], np.degrees(1e3) ** 2 * C.exterior[:, 3:, 3:], C.points)
-        # per coordinate, RMS of three
-        sigmas.append([significant(float(np.median(np.sqrt(np.einsum("nii->n", Q) / 3)))) for Q in parts])
+        variances = [np.einsum("nii->n", Q) / 3 for Q in parts]  # per coordinate
+        known = [of_part[of_part > 0] for of_part in variances]  # else rounding hides them
+        sigmas.append(
+            [significant(float(np.sqrt(np.median(of_part)))) if len(of_part) else "none" for of_part in known]
+        )
         shared.append(
             "none" if correlation is None else significant(correlation.sigmas_px(adjusted.sigma0_px)[1])
         )
