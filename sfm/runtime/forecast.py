@@ -22,6 +22,7 @@ OTHERS_APART = math.log(8.0)  # a run of the user is preferred to a typical one 
 # Relative standard deviation of an expected time, and by how many parts the finished ones misstate how far a
 # stage is, as others are in work: runs of one kind and two threads (estimates).
 EXPECTED_SIGMA, PARTS_SIGMA = 0.3, 0.7
+LARGEST = 1e6  # of photographs, of 10^6 pixels and of seconds, which no survey reaches
 STORED_SHARE = 0.2  # of its expected time, below which a stage read what an earlier run measured
 # How the time of a stage grows with photographs, and with the pixels of each. Tie points, windows and the
 # pictures of the report are limited in number, but sought in all pixels.
@@ -113,34 +114,42 @@ def expected_seconds(work: Work, runs: Sequence[Run]) -> dict[str, float]:
 class RunHistory:
     """The last runs of a user, one line of a file each; lines that are damaged are passed over."""
 
-    def __init__(self, path: Path) -> None:
+    def __init__(self, path: Path, *, is_kept: bool = True) -> None:
         self.path = path
+        self.is_kept = is_kept  # else nothing is read or written
 
     @classmethod
     def of_user(cls) -> RunHistory:
         """Return the history in the user's cache folder (XDG_CACHE_HOME).
 
-        Raises:
-            OutputError: other users can write into the folder.
+        Where other users can write into the folder, nothing is read or kept, and the survey goes on.
         """
-        return cls(user_folder("runs", "times of runs") / "runs.jsonl")
+        try:
+            return cls(user_folder("runs", "times of runs") / "runs.jsonl")
+        except OutputError:
+            return cls(Path(), is_kept=False)
 
     def read(self) -> list[Run]:
         """Return the runs, the last one last."""
-        runs = []
+        runs = list[Run]()
+        if not self.is_kept:
+            return runs
         with suppress(OSError, UnicodeDecodeError):
             for line in self.path.read_text("utf-8").splitlines()[-KEPT_RUNS:]:
-                with suppress(ValueError, TypeError, KeyError, AttributeError):
+                with suppress(ValueError, TypeError, KeyError, AttributeError, OverflowError, RecursionError):
                     row = json.loads(line)
                     work = Work(tuple(map(str, row["sources"])), int(row["photographs"]), row["megapixels"])
                     seconds = {str(stage): float(took) for stage, took in row["seconds"].items()}
-                    numbers = (work.megapixels, *seconds.values())
-                    if work.photographs > 0 and all(0 <= number < math.inf for number in numbers):
+                    numbers = (work.photographs, work.megapixels, *seconds.values())
+                    in_range = all(0 <= number <= LARGEST for number in numbers)
+                    if in_range and work.photographs and not 0 < work.megapixels < 1 / LARGEST:
                         runs.append(Run(work, seconds))
         return runs
 
     def add(self, run: Run) -> None:
         """Keep a run, and forget the oldest beyond `KEPT_RUNS`; without room on the disk it is not kept."""
+        if not self.is_kept:
+            return
         kept = [*self.read()[1 - KEPT_RUNS :], run]
         lines = [json.dumps(asdict(each.work) | {"seconds": each.seconds}) for each in kept]
         with suppress(OSError, OutputError):
@@ -181,7 +190,8 @@ class Countdown:
             for name, took in known.items()
             if took > STORED_SHARE * self.expected.get(name, math.inf)
         ]
-        slower = sum(took for took, _ in compared) / sum(of for _, of in compared) if compared else 1.0
+        of_compared = sum(of for _, of in compared)  # 0 where a coarse clock measured nothing
+        slower = sum(took for took, _ in compared) / of_compared if of_compared > 0 else 1.0
         of_stage = counted if counted is not None else slower * self.expected.get(stage, 0.0)
         later = sum(s for name, s in self.expected.items() if name != stage and name not in self.taken)
         return max(0.0, of_stage - elapsed) + slower * later

@@ -12,6 +12,8 @@ from rich.text import Text
 
 from sfm.runtime.forecast import Countdown
 
+LONGEST_S = 1e9  # that is shown
+
 
 @contextmanager
 def drawn_progress(console: Console | None = None) -> Iterator[DrawnProgress]:
@@ -119,4 +121,4 @@ class _Times(ProgressColumn):
 
 def _clock(seconds: float) -> str:
     """Return a time as hours, minutes and seconds."""
-    return str(timedelta(seconds=max(0, round(seconds))))
+    return str(timedelta(seconds=round(min(max(seconds, 0.0), LONGEST_S))))

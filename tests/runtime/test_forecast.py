@@ -30,7 +30,7 @@ def test_the_nearest_run_of_the_same_sources_is_scaled() -> None:
     assert expected_seconds(SMALL.work, [SMALL, again]) == again.seconds  # of equals the last
 
 
-def test_without_a_run_of_ones_own_a_typical_one_stands_in_for_each_combination() -> None:
+def test_without_a_run_of_ones_own_a_typical_one_of_its_sources_stands_in() -> None:
     for run in TYPICAL:
         assert expected_seconds(run.work, []) == pytest.approx(run.seconds)
     elsewhere = Run(Work(("texture",), 11, 6.29), {"tie points": 1.0})
@@ -73,6 +73,14 @@ def test_runs_are_kept_and_damaged_lines_are_passed_over(tmp_path: Path) -> None
     for number in ("NaN", "Infinity", "-1.0"):
         history.path.write_text(good.replace("5.0", number), "utf-8")
         assert history.read() == [LARGE]
+    hostile = (
+        *("[" * 100_000, good.replace("5.0", "1" + 400 * "0"), good.replace("5.0", "1e300")),
+        *(good.replace(": 10,", f": {number},") for number in ("1" + 400 * "0", "1e400", "0")),
+        *(good.replace('"megapixels": 1.0', f'"megapixels": {number}') for number in ("5e-324", "1e300")),
+    )
+    for text in hostile:
+        history.path.write_text(f"{text.splitlines()[0]}\n{good.splitlines()[1]}", "utf-8")
+        assert history.read() == [LARGE]
     history.path.write_bytes(b"\xff\xfe")
     assert history.read() == []
     for _ in range(3):
@@ -83,6 +91,25 @@ def test_runs_are_kept_and_damaged_lines_are_passed_over(tmp_path: Path) -> None
     history.path.mkdir()
     history.add(SMALL)  # it cannot be kept, which is no fault of the run
     assert history.read() == []
+
+
+def test_a_folder_that_others_may_write_keeps_nothing(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path))
+    kept = RunHistory.of_user()
+    kept.add(SMALL)
+    assert RunHistory.of_user().read() == [SMALL]
+    kept.path.parent.chmod(0o777)
+    before = kept.path.read_bytes()
+    RunHistory.of_user().add(LARGE)
+    assert RunHistory.of_user().read() == [] and kept.path.read_bytes() == before
+
+
+def test_stages_that_took_no_time_forecast_none() -> None:
+    countdown = Countdown({"targets": 0.0, "orientation": 4.0})
+    countdown.finish("targets", 0.02)
+    assert countdown.left("orientation", 1.0) == pytest.approx(3.0)
 
 
 def test_the_time_to_the_end_is_drawn_and_the_stages_are_kept() -> None:
