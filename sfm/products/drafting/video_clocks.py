@@ -19,6 +19,7 @@ from sfm.model.distributions import LEVEL, normal_sf
 
 COMMON_SHARE = 0.5  # of the variance of the motion, above which it is that of one rig
 MIN_OVERLAP = 0.5  # of the shorter video
+MAX_STEPS = 200_000  # between frames, two hours at 30 frames a second; longer ones have a damaged time
 # Standard deviation of the place of a maximum between frames by the parabola through three correlations, in
 # frames: 0.1 in rendered pairs of 12 and 15 frames a second.
 FRAME_SHARE = 0.1
@@ -42,19 +43,24 @@ def clock_difference(
         reference: times of its frames, s, and the speed of their apparent motion, (k,).
         other: the same of the other video.
     """
-    step = max(float(np.median(np.diff(times))) for times, _ in (reference, other) if len(times) > 1)
-    a, b = (_evenly(times, speed, step) for times, speed in (reference, other))
+    videos = (reference, other)
+    if min(len(times) for times, _ in videos) < 2:
+        return None
+    step = max(float(np.median(np.diff(times))) for times, _ in videos)
+    longest = max(float(times[-1] - times[0]) for times, _ in videos)
+    if step <= 0 or longest > MAX_STEPS * step:
+        return None
+    a, b = (_evenly(times, speed, step) for times, speed in videos)
     shortest = round(MIN_OVERLAP * min(len(a), len(b)))
     if shortest < 4:
         return None
     shifts = np.arange(shortest - len(a), len(b) - shortest + 1)
-    found = [_correlation(a, b, shift) for shift in shifts.tolist()]
-    r = np.array([correlation for correlation, _ in found])
+    r = np.array([_correlation(*_overlap(a, b, shift)) for shift in shifts.tolist()])
     k = int(np.argmax(r))
-    correlation, periods = found[k]
+    correlation, periods = float(r[k]), _periods(*_overlap(a, b, int(shifts[k])))
     z = np.arctanh(min(correlation, 1 - 1e-12)) * np.sqrt(max(periods - 3, 0.0))
     tried = max(1.0, len(shifts) * periods / max(len(a), len(b)))
-    if correlation**2 < COMMON_SHARE or tried * float(normal_sf(z)) >= LEVEL:
+    if correlation <= 0 or correlation**2 < COMMON_SHARE or tried * float(normal_sf(z)) >= LEVEL:
         return None
     place = float(shifts[k])
     if 0 < k < len(r) - 1 and (curved := r[k - 1] - 2 * r[k] + r[k + 1]) < 0:
@@ -70,20 +76,29 @@ def _evenly(times: FloatArray, speed: FloatArray, step: float) -> FloatArray:
     return np.sqrt(np.interp(at, times[known], speed[known])) if known.any() else np.zeros(len(at))
 
 
-def _correlation(a: FloatArray, b: FloatArray, shift: int) -> tuple[float, float]:
-    """Return the correlation of two series where they overlap, and how many independent values it has.
+def _overlap(a: FloatArray, b: FloatArray, shift: int) -> tuple[FloatArray, FloatArray]:
+    """Return two series where they overlap, each less its mean.
 
     shift: place in `b` of the first value of `a`.
     """
     first, last = max(0, -shift), min(len(a), len(b) - shift)
-    parts = [series - series.mean() for series in (a[first:last], b[first + shift : last + shift])]
-    lengths = [float(np.linalg.norm(part)) for part in parts]
-    if min(lengths) == 0:
-        return 0.0, 0.0
-    n = last - first
-    own = [
-        np.correlate(part, part, "full")[n - 1 : n + n // 4] / length**2
-        for part, length in zip(parts, lengths, strict=True)
-    ]
-    memory = 1 + 2 * float((own[0][1:] * own[1][1:]).clip(min=0).sum())
-    return float(parts[0] @ parts[1]) / (lengths[0] * lengths[1]), n / memory
+    of_a, of_b = a[first:last], b[first + shift : last + shift]
+    return of_a - of_a.mean(), of_b - of_b.mean()
+
+
+def _correlation(a: FloatArray, b: FloatArray) -> float:
+    """Return the correlation of two series whose means are zero; 0 if one of them is constant."""
+    length = float(np.linalg.norm(a)) * float(np.linalg.norm(b))
+    return float(a @ b) / length if length else 0.0
+
+
+def _periods(a: FloatArray, b: FloatArray) -> float:
+    """Return how many independent values the correlation of two series has, whose means are zero."""
+    n, product = len(a), np.ones(len(a) // 4)
+    for series in (a, b):
+        power = float(series @ series)
+        if not power:
+            return 0.0
+        spectrum = np.abs(np.fft.rfft(series, 2 * n)) ** 2
+        product *= np.fft.irfft(spectrum, 2 * n)[1 : 1 + n // 4] / power  # correlation with itself, later
+    return n / (1 + 2 * float(product.clip(min=0).sum()))

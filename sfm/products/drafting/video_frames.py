@@ -236,11 +236,34 @@ def choose_of_all(ways: Sequence[Way], count: int | None = None) -> tuple[Chosen
             filmed = np.isfinite(moved)  # else the video begins later, or has ended
             nearest, places = np.unique(nearest[filmed], return_index=True)
             shared = moved[filmed][places] <= SAME_PLACE_RAD
-            own = ways[k].times_s[nearest] - clock.ahead_s
-            chosen[k] = ChosenFrames(
-                nearest, np.where(shared, at[filmed][places], own), first, clock.ahead_s, int(shared.sum())
-            )
+            moment_of = dict(zip(nearest[shared].tolist(), at[filmed][places][shared].tolist(), strict=True))
+            frames_of = np.union1d(nearest, _frames_outside(ways[k], way, clock, count))
+            if not len(frames_of):
+                frames_of = choose_frames(ways[k], count)
+            own = np.maximum(ways[k].times_s[frames_of] - clock.ahead_s, 0.0)
+            own[np.isin(np.round(1000 * own), np.round(1000 * at))] += 0.001  # such names state one moment
+            moments = [
+                moment_of.get(frame, time) for frame, time in zip(frames_of.tolist(), own, strict=True)
+            ]
+            chosen[k] = ChosenFrames(frames_of, np.array(moments), first, clock.ahead_s, len(moment_of))
     return tuple(chosen[k] for k in range(len(ways)))
+
+
+def _frames_outside(way: Way, reference: Way, clock: ClockDifference, count: int | None) -> IntArray:
+    """Return frames of a video before another begins and after it ends, none if their number is stated."""
+    at = way.times_s - clock.ahead_s
+    frames = [np.zeros(0, dtype=np.int64)]
+    for outside in (at < reference.times_s[0], at > reference.times_s[-1]):
+        rows = np.flatnonzero(outside)
+        if count is None and len(rows) and np.ptp(way.way_rad[rows]) >= SPACING_RAD:
+            part = Way(
+                way.times_s[rows],
+                way.way_rad[rows] - way.way_rad[rows[0]],
+                way.sharpness[rows],
+                way.speed[rows],
+            )
+            frames.append(rows[choose_frames(part)])
+    return np.concatenate(frames)
 
 
 def _nearest(way: Way, at: FloatArray, clock: ClockDifference) -> tuple[IntArray, FloatArray]:
@@ -361,7 +384,8 @@ def extract_frames(
 ) -> tuple[WrittenFrames, ...]:
     """Write sharp frames of videos, spaced by the motion of the camera, as photographs.
 
-    Frames of videos that move together are of the same moments, by which they are named.
+    Frames of videos that move together are taken near the same moments. Those of one moment, where the
+    cameras stand still, have the same time in their names.
 
     Args:
         videos: files; each is a camera.
@@ -383,11 +407,13 @@ def extract_frames(
         if chosen.reference is not None:
             name = as_plain(videos[chosen.reference].name)
             later = f"{abs(chosen.ahead_s):.2f} s {'later' if chosen.ahead_s < 0 else 'earlier'}"
-            still = "" if chosen.shared else "; stop at each place to let frames of both be of one moment"
-            said.append(
-                f"moves together with {name} and begins {later}: {counted(chosen.shared, 'frame')} of "
-                f"{len(chosen.frames)} of one moment, where the cameras stand still, and named so{still}"
+            shared = (
+                f"{chosen.shared} of {counted(len(chosen.frames), 'frame')} show a moment of that video, "
+                "where the cameras stand still, and have the same time in their names"
+                if chosen.shared
+                else "no frame shows a moment of that video, as the cameras move; stop at each place"
             )
+            said.append(f"moves together with {name} and begins {later}: {shared}")
         alike = [other for other in videos if other.stem.casefold() == path.stem.casefold()]
         name = as_plain(path.stem if len(alike) < 2 else path.name.replace(".", "-"))
         with opened_video(path) as video:

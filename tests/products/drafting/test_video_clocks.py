@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import time
 from pathlib import Path
 
 import numpy as np
@@ -104,4 +105,50 @@ def test_videos_of_a_rig_have_frames_of_the_same_names(tmp_path: Path) -> None:
     assert "moves together with left.mp4 and begins 1.1" in said and " s later: " in said
     moments = [{name.split("-")[1] for name in written.names} for written in (first, second)]
     assert len(moments[0] & moments[1]) >= 5
-    assert f"{len(moments[0] & moments[1])} frames of {len(second.names)} of one moment" in said
+    assert f"{len(moments[0] & moments[1])} of {len(second.names)} frames show a moment of that" in said
+
+
+@pytest.mark.parametrize("rate", [25.0, 1000 / 37])
+def test_frames_that_are_not_of_one_moment_have_other_names(rate: float) -> None:
+    rng = seed_of("moving on")
+    motion = speeds(rng, 30.0)[0], 0.2 + speeds(rng, 30.0)[1]  # never still
+    alone, other = (way_of(motion, np.arange(0, 25, 1 / rate), 0.0) for _ in range(2))
+    first, second = choose_of_all([alone, other])
+    assert second.reference == 0 and second.shared == 0 and len(second.frames) > 8
+    names = [set(np.round(1000 * chosen.moments_s).tolist()) for chosen in (first, second)]
+    assert not names[0] & names[1] and len(names[1]) == len(second.frames)
+
+
+def test_what_only_one_of_two_videos_shows_gives_frames_too() -> None:
+    motion = speeds(seed_of("long and short"), 60.0)
+    short = way_of(motion, np.arange(20, 35, 1 / 25), 0.0)
+    long = way_of(motion, np.arange(0, 60, 1 / 25), 0.0)
+    _, second = choose_of_all([short, long])
+    assert second.reference == 0
+    at = long.times_s[second.frames]
+    assert at.min() < 3 and at.max() > 55 and len(at) == len(set(at))
+    alone = choose_of_all([long])[0]
+    assert np.diff(long.way_rad[second.frames]).max() < 2 * np.diff(long.way_rad[alone.frames]).max()
+    assert all(len(chosen.frames) == 1 for chosen in choose_of_all([long, short], 1))
+
+
+def test_videos_without_usable_times_have_no_difference() -> None:
+    one = np.zeros(1), np.array([np.nan])
+    rng = seed_of("times")
+    many = np.arange(0, 10, 0.04), rng.random(250)
+    same = np.zeros(50), rng.random(50)
+    jump = np.append(many[0][:-1], 1e9), many[1]
+    for a in (one, same, jump):
+        for b in (one, same, jump, many):
+            assert clock_difference(a, b) is None and clock_difference(b, a) is None
+
+
+def test_long_videos_are_compared_in_seconds() -> None:
+    rng = seed_of("ten minutes")
+    motion = speeds(rng, 650.0)
+    a = seen(motion, np.arange(0, 600, 1 / 15), 0.0, rng)
+    b = seen(motion, np.arange(0, 600, 1 / 15), AHEAD_S, rng)
+    begun = time.perf_counter()
+    clock = clock_difference(a, b)
+    assert clock is not None and abs(clock.ahead_s - AHEAD_S) < 4 * clock.sigma_s
+    assert time.perf_counter() - begun < 20  # the correlation times of every difference took minutes
