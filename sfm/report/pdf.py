@@ -33,13 +33,20 @@ def pdf_printer() -> Printer:
     """Return what prints pages here: a browser on the path, else WeasyPrint.
 
     Raises:
-        MissingLibraryError: there is neither.
+        MissingLibraryError: there is neither, or WeasyPrint cannot be loaded.
     """
     for name in BROWSERS:
         browser = shutil.which(name)
         if browser is not None:
             return lambda page, pdf: _print_by_browser(browser, page, pdf)
     if find_spec("weasyprint") is not None:
+        try:
+            import weasyprint  # noqa: F401 - it loads Pango, which pip does not install
+        except (ImportError, OSError) as error:
+            raise MissingLibraryError(
+                "--pdf needs Pango, without which WeasyPrint cannot be loaded, or Chromium, Chrome or Edge "
+                f"on the path: {one_line(error)[:100]}"
+            ) from error
         return _print_by_weasyprint
     raise MissingLibraryError(
         "--pdf needs Chromium, Chrome or Edge on the path, or WeasyPrint; install one of them, the last "
@@ -64,14 +71,18 @@ def write_pdf(page: Path) -> Path:
     with whole_files(page.parent, "the PDF") as folder:
         printed = folder / f"{page.stem}.pdf"
         printer(page.resolve(), printed)
-        with printed.open("rb") if printed.is_file() else open(os.devnull, "rb") as file:
-            if file.read(5) != b"%PDF-":
-                raise OutputError(f"{page}: was not printed, no PDF was made")
+        begins = b""
+        if printed.is_file():
+            with printed.open("rb") as file:
+                begins = file.read(5)
+        if begins != b"%PDF-":
+            raise OutputError(f"{page}: was not printed, no PDF was made")
     return page.with_suffix(".pdf")
 
 
 def _print_by_browser(browser: str, page: Path, pdf: Path) -> None:
-    with tempfile.TemporaryDirectory(prefix="kolinear-print-") as profile:
+    # processes of a browser that was stopped may still write into its profile
+    with tempfile.TemporaryDirectory(prefix="kolinear-print-", ignore_cleanup_errors=True) as profile:
         command = [
             browser,
             "--headless",

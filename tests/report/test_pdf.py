@@ -90,6 +90,11 @@ def test_without_a_printer_one_line_says_what_to_install(
     monkeypatch.setattr(printing, "find_spec", lambda name: None)
     with pytest.raises(MissingLibraryError, match="--pdf needs Chromium, Chrome or Edge on the path"):
         pdf_printer()
+    monkeypatch.setattr(printing, "find_spec", lambda name: name)
+    monkeypatch.setitem(sys.modules, "weasyprint", None)  # as without Pango
+    with pytest.raises(MissingLibraryError, match="--pdf needs Pango, without which WeasyPrint cannot be"):
+        pdf_printer()
+    monkeypatch.setattr(printing, "find_spec", lambda name: None)
     monkeypatch.setattr(sys, "argv", ["kolinear", "run", "none.toml", "--pdf"])
     with pytest.raises(SystemExit) as ended:
         main()  # before the survey is looked at
