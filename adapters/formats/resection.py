@@ -21,6 +21,7 @@ from adapters.reading.trees import read_tree
 from sfm.model.conventions import angles_from_rotation
 
 WHAT = "resection"
+ROUNDING = 1e-9  # of the eigenvalues of correlations
 
 
 def read_resection(path: Path) -> Content:
@@ -45,5 +46,11 @@ def read_resection(path: Path) -> Content:
     if tree.key("dispersion"):
         unit = np.array([1, 1, 1, *[np.radians(1.0)] * 3])
         C = tree.numbers(("dispersion",), 36).reshape(6, 6) * np.outer(unit, unit)
+        sigma = np.sqrt(np.maximum(np.diag(C), 0.0))
+        if not (sigma > 0).all():
+            raise tree.error("dispersion is no covariance: the variances must be positive")
+        correlation = C / np.outer(sigma, sigma)
+        if not np.allclose(correlation, correlation.T) or np.linalg.eigvalsh(correlation)[0] < -ROUNDING:
+            raise tree.error("dispersion is no covariance, which is symmetric and not negative")
         stated.exterior[0] = position, angles_from_rotation(rotation), C
     return content_of(stated)

@@ -61,6 +61,9 @@ def test_two_resections_are_compared(pose: Path, tmp_path: Path, capsys: pytest.
         ({"solutions": []}, "solutions is empty: the resection found no pose"),
         ({"photograph": None}, "photograph"),
         ({"dispersion": [1, 2]}, "dispersion"),
+        ({"dispersion": (-np.eye(6)).tolist()}, "dispersion is no covariance: the variances"),
+        ({"dispersion": (np.eye(6) + np.eye(6, k=1)).tolist()}, "dispersion is no covariance, which is"),
+        ({"dispersion": (3 * np.ones((6, 6)) - 2.5 * np.eye(6)).tolist()}, "dispersion is no covariance"),
     ],
 )
 def test_damaged_files_are_refused_in_one_line(pose: Path, change: dict[str, object], message: str) -> None:
