@@ -289,16 +289,22 @@ def _joint_way(reference: Way, others: Sequence[tuple[Way, ClockDifference]]) ->
 
     others: ways of the other cameras, and their clocks.
     """
-    ways, sharpness = [reference.way_rad], [reference.sharpness / np.median(reference.sharpness)]
+    ways, sharpness = [reference.way_rad], [_relative(reference.sharpness)]
     for other, clock in others:
         at = reference.times_s + clock.ahead_s
         ways.append(np.interp(at, other.times_s, other.way_rad))
         nearest, moved = _nearest(other, reference.times_s, clock)
-        relative = other.sharpness[nearest] / np.median(other.sharpness)
+        relative = _relative(other.sharpness)[nearest]
         sharpness.append(relative / (1 + np.where(np.isfinite(moved), moved, 0.0) / SAME_PLACE_RAD))
     gone = np.diff(ways, axis=1, prepend=0.0).max(axis=0)
     gone[0] = 0.0
     return replace(reference, way_rad=np.cumsum(gone), sharpness=np.min(sharpness, axis=0))
+
+
+def _relative(sharpness: FloatArray) -> FloatArray:
+    """Return the sharpness of frames over the usual one of their video, most of which may be black."""
+    usual = float(np.median(sharpness))
+    return sharpness / usual if usual > 0 else sharpness
 
 
 def write_frames(video: Video, chosen: ChosenFrames, folder: Path, name: str) -> tuple[str, ...]:

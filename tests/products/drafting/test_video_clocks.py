@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import time
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -130,6 +131,14 @@ def test_what_only_one_of_two_videos_shows_gives_frames_too() -> None:
     alone = choose_of_all([long])[0]
     assert np.diff(long.way_rad[second.frames]).max() < 2 * np.diff(long.way_rad[alone.frames]).max()
     assert all(len(chosen.frames) == 1 for chosen in choose_of_all([long, short], 1))
+
+
+@pytest.mark.filterwarnings("error")
+def test_frames_without_any_structure_are_compared() -> None:
+    motion = speeds(seed_of("black"), 30.0)
+    way = way_of(motion, np.arange(0, 25, 1 / 25), 0.0)
+    first, second = choose_of_all([replace(way, sharpness=np.zeros(len(way.times_s)))] * 2)
+    assert second.reference == 0 and len(first.frames) > 4
 
 
 def test_videos_without_usable_times_have_no_difference() -> None:
