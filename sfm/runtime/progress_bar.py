@@ -25,11 +25,11 @@ def drawn_progress(console: Console | None = None) -> Iterator[DrawnProgress]:
     console = console or Console(stderr=True)
     countdown = Countdown()
     with Progress(
-        TextColumn("{task.description:12}"),
+        TextColumn("{task.description:12}", markup=False),
         BarColumn(),
         _Counted(),
         _Times(countdown),
-        TextColumn("{task.fields[step]}", style="dim"),
+        TextColumn("{task.fields[step]}", style="dim", markup=False),
         console=console,
         disable=not console.is_terminal,
     ) as bar:
@@ -47,11 +47,11 @@ class DrawnProgress:
         self._task: TaskID | None = None
 
     def stage(self, name: str, total: int | None = None) -> None:
-        """Begin a line for the stage; a second call for the same stage gives its total."""
+        """Begin a line for the stage; a second call for the same stage gives its total, and counts anew."""
         if self._task is not None:
             task = self._bar.tasks[-1]
             if task.description == name:
-                self._bar.update(self._task, total=total, parts=total)
+                self._bar.update(self._task, total=total, completed=0, parts=total)
                 return
             self._bar.update(self._task, total=task.total or 1, completed=task.total or 1, step="")
             self._bar.stop_task(self._task)

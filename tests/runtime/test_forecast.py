@@ -124,6 +124,17 @@ def test_the_time_to_the_end_is_drawn_and_the_stages_are_kept() -> None:
         assert progress.finished().keys() == {"targets", "report"}
 
 
+def test_names_are_drawn_as_they_are_and_each_video_is_counted() -> None:
+    console = Console(file=io.StringIO(), force_terminal=True, width=160, color_system=None)
+    with drawn_progress(console) as progress:
+        for total in (3, 2):
+            progress.stage("frames", total)
+            progress.advance("a[/b].jpg")
+            progress._bar.refresh()
+            drawn = console.file.getvalue()  # type: ignore[attr-defined]
+            assert f"1/{total}" in drawn and "a[/b].jpg" in drawn
+
+
 def test_a_run_is_kept_once_measured_anew(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     from sfm.cli.survey_runs import RunOptions, run_survey_file
 
