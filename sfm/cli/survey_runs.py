@@ -157,7 +157,9 @@ def run_survey_file(survey_file: Path, options: RunOptions) -> Path:
             result = run_survey(
                 survey, images_dir=images, jobs=workers, others=others, store=store, progress=log
             )
-            if options.product is not None and options.product.revise(survey_file, result):
+            revised = options.product is not None and options.product.revise(survey_file, result)
+            if revised:
+                drawn.countdown.taken.clear()  # all stages but the measurement come again
                 survey = survey_of_file(read_survey_file(survey_file, allow_outside=options.allow_outside))
                 result = run_survey(
                     survey, images_dir=images, jobs=workers, others=others, store=store, progress=log
@@ -179,7 +181,7 @@ def run_survey_file(survey_file: Path, options: RunOptions) -> Path:
             progress=log,
             plot_process=plots,
         )
-        if store is None or not store.has_earlier:
+        if not revised and (store is None or not store.has_earlier):
             history.add(Run(work, drawn.finished()))
     seconds = time.perf_counter() - begun
     if options.product is not None:

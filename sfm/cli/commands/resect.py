@@ -59,7 +59,8 @@ def resect(
 ) -> None:
     """Orient one photograph from known points (space resection).
 
-    Uses one method, or all methods for a comparison. What --json prints can be given to compare.
+    Uses one method, or all methods for a comparison. What --json prints of one method can be
+    given to compare.
     """
     with loading():
         from sfm.cli.resection_inputs import read_tasks
