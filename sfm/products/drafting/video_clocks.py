@@ -50,12 +50,21 @@ def clock_difference(
     longest = max(float(times[-1] - times[0]) for times, _ in videos)
     if step <= 0 or longest > MAX_STEPS * step:
         return None
-    a, b = (_evenly(times, speed, step) for times, speed in videos)
+    series = []
+    for times, speed in videos:
+        known, at = np.isfinite(speed), np.arange(times[0], times[-1] + step / 2, step)
+        evenly = np.interp(at, times[known], speed[known]) if known.any() else np.zeros(len(at))
+        series.append(np.sqrt(evenly))  # few fast moments say little
+    a, b = series
     shortest = round(MIN_OVERLAP * min(len(a), len(b)))
     if shortest < 4:
         return None
     shifts = np.arange(shortest - len(a), len(b) - shortest + 1)
-    r = np.array([_correlation(*_overlap(a, b, shift)) for shift in shifts.tolist()])
+    r = np.zeros(len(shifts))
+    for k, shift in enumerate(shifts.tolist()):
+        of_a, of_b = _overlap(a, b, shift)
+        length = float(np.linalg.norm(of_a)) * float(np.linalg.norm(of_b))
+        r[k] = float(of_a @ of_b) / length if length else 0.0  # 0 if one of them is constant
     k = int(np.argmax(r))
     correlation, periods = float(r[k]), _periods(*_overlap(a, b, int(shifts[k])))
     z = np.arctanh(min(correlation, 1 - 1e-12)) * np.sqrt(max(periods - 3, 0.0))
@@ -69,13 +78,6 @@ def clock_difference(
     return ClockDifference(ahead, FRAME_SHARE * step, correlation)
 
 
-def _evenly(times: FloatArray, speed: FloatArray, step: float) -> FloatArray:
-    """Return the speed at even steps from the first frame on; its root, as few fast moments say little."""
-    known = np.isfinite(speed)
-    at = np.arange(times[0], times[-1] + step / 2, step)
-    return np.sqrt(np.interp(at, times[known], speed[known])) if known.any() else np.zeros(len(at))
-
-
 def _overlap(a: FloatArray, b: FloatArray, shift: int) -> tuple[FloatArray, FloatArray]:
     """Return two series where they overlap, each less its mean.
 
@@ -84,12 +86,6 @@ def _overlap(a: FloatArray, b: FloatArray, shift: int) -> tuple[FloatArray, Floa
     first, last = max(0, -shift), min(len(a), len(b) - shift)
     of_a, of_b = a[first:last], b[first + shift : last + shift]
     return of_a - of_a.mean(), of_b - of_b.mean()
-
-
-def _correlation(a: FloatArray, b: FloatArray) -> float:
-    """Return the correlation of two series whose means are zero; 0 if one of them is constant."""
-    length = float(np.linalg.norm(a)) * float(np.linalg.norm(b))
-    return float(a @ b) / length if length else 0.0
 
 
 def _periods(a: FloatArray, b: FloatArray) -> float:
