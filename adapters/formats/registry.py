@@ -141,6 +141,11 @@ class FileFormat:
         return "object points" in self.keeps and "exterior orientations" not in self.keeps
 
     @property
+    def writable(self) -> bool:
+        """Whether it can be written."""
+        return self.write is not None or self.write_all is not None
+
+    @property
     def readable(self) -> bool:
         """Whether it has photographs and can be read."""
         return not self.only_points and (self.read is not None or self.read_all is not None)
@@ -633,6 +638,8 @@ def write_content(path: Path, name: str, content: Content) -> None:
         KolinearError: the format cannot store the survey, a number is not finite, or it cannot be written.
     """
     form = format_named(name)
+    if not form.writable:
+        raise OutputError(f"{path}: format {form.name} can only be read")
     estimate = content.result.estimate
     refuse_taken(path, form)
     refuse_not_finite(path, content)

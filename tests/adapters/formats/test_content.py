@@ -27,7 +27,7 @@ from sfm.pipeline import run_survey
 from sfm.survey.inputs.survey import read_survey
 from tests.synthetic import make_network, seed_of
 
-READABLE = tuple(form.name for form in FORMATS if form.readable)
+READABLE = tuple(form.name for form in FORMATS if form.readable and form.writable)
 MODEL_OF = {"bal": "radial", "photomodeler": "brown_dbat", "metashape": "opencv", "sba": "opencv"}
 MODEL_OF |= {"opensfm": "opencv", "nerfstudio": "opencv", "alicevision": "opencv", "bundler": "radial"}
 MODEL_OF |= {"nvm": "brown", "openmvg": "brown_forward", "micmac": "brown_forward"}

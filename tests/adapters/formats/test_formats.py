@@ -494,7 +494,12 @@ def test_what_was_written_is_reported(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize(
-    "name", [form.name for form in FILE_FORMATS if form.readable and form.name != "colmap-database"]
+    "name",
+    [
+        form.name
+        for form in FILE_FORMATS
+        if form.readable and form.writable and form.name != "colmap-database"
+    ],
 )
 def test_formats_are_recognised_and_go_round_by_name(name: str, tmp_path: Path) -> None:
     """From brown through any format: converted where it must be, read back by what is there."""

@@ -25,11 +25,7 @@ PARTS_OF = {
     "cameras": {"cameras"},
     "points": {"object points"},
 }
-READ = tuple(
-    form
-    for form in FORMATS
-    if (form.read or form.read_all) is not None and (form.write or form.write_all) is not None
-)
+READ = tuple(form for form in FORMATS if (form.read or form.read_all) is not None and form.writable)
 STRAIGHT = ("bal", "sba", "bundle-matlab", "bundle-csharp")  # which want --undistort
 
 

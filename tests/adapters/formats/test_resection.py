@@ -8,9 +8,9 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from adapters.formats.registry import format_of, read_comparable, read_content
+from adapters.formats.registry import format_of, read_comparable, read_content, write_content
 from sfm.model.conventions import angles_from_rotation
-from sfm.model.errors import SurveyFileError
+from sfm.model.errors import OutputError, SurveyFileError
 from tests.commands import kolinear
 from tests.places import DATASETS
 
@@ -70,6 +70,12 @@ def test_damaged_files_are_refused_in_one_line(pose: Path, change: dict[str, obj
     pose.write_text(json.dumps(json.loads(pose.read_text("utf-8")) | change), "utf-8")
     with pytest.raises(SurveyFileError, match=message):
         read_comparable(pose, "resection")
+
+
+def test_nothing_is_written_as_one(pose: Path, tmp_path: Path) -> None:
+    with pytest.raises(OutputError, match="format resection can only be read"):
+        write_content(tmp_path / "new.json", "resection", read_content(pose))
+    assert not (tmp_path / "new.json").exists()
 
 
 def test_a_mirrored_rotation_is_refused(pose: Path) -> None:

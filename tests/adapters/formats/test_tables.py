@@ -194,7 +194,7 @@ MODEL_OF = {"bundler": "radial", "nvm": "brown"}
 MODEL_OF |= dict.fromkeys(("openmvg", "micmac", "aicon", "realitycapture"), "brown_forward")
 
 
-@pytest.mark.parametrize("name", [form.name for form in FORMATS])
+@pytest.mark.parametrize("name", [form.name for form in FORMATS if form.writable])
 def test_a_full_disk_leaves_nothing_and_says_why(name: str, tmp_path: Path) -> None:
     library(name)
     model = "brown" if name in ("photomodeler", "bundle-csharp", "bundle-matlab") else "opencv"
