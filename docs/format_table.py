@@ -54,7 +54,6 @@ def table() -> str:
     lines = ["| format | read | written | a round trip keeps | tried on |", "|---|---|---|---|---|"]
     for form in FORMATS:
         read = form.read is not None or form.read_all is not None
-        written = form.write is not None or form.write_all is not None
         kept = [words for kind, words in WORDS.items() if kind in form.keeps and read]
         if form.name == "agisoft-reference":
             kept.append("observed poses without correlations")
@@ -62,7 +61,7 @@ def table() -> str:
         cells = (
             form.name,
             "yes" if read else "",
-            "yes" if written else "",
+            "yes" if form.writable else "",
             ", ".join(kept) or "not read",
             tried,
         )

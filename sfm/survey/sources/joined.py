@@ -430,12 +430,7 @@ def _joined_correspondences(
     repeated = repeated.after(measured)
     images = _indices(network.images, measured.network.images)
     position, rotation = start.estimate.position[images].copy(), start.estimate.rotation[images].copy()
-    elsewhere = {
-        name: reason
-        for matched in completed
-        for name, reason in matched.left_out
-        if reason.kind != "photograph_with_few_fitting"
-    }
+    elsewhere = {name: reason for matched in completed for name, reason in matched.left_out}
     out = np.isin(network.images, list(elsewhere))
     position[out], rotation[out] = np.nan, np.nan
     estimate = replace(start.estimate, position=position, rotation=rotation)
