@@ -63,9 +63,10 @@ class GivenTest:
     """Test of one kind of given values against the free network."""
 
     what: str  # scale, control points or projection centres
-    statistic: float  # chi-square
+    statistic: float | None  # chi-square; None if the values have no standard deviations
     dof: int
     probability: float  # of such differences by chance
+    others: int | None = None  # values that each is compared with if these have no standard deviations
 
 
 @dataclass(frozen=True)

@@ -383,7 +383,14 @@ def given_remarks(
     """
     level = result.adjustment.levels.question
     tests = [
-        remark("given_tested", of=test.what, chi2=test.statistic, dof=test.dof, p=test.probability)
+        remark(
+            "given_tested",
+            of=test.what,
+            chi2=test.statistic,
+            others=test.others,
+            dof=test.dof,
+            p=test.probability,
+        )
         for test in result.given_tests
         if test.dof  # else nothing was tested
     ]

@@ -64,6 +64,7 @@ class Source:
     # factor by which errors in common multiply the variance of what its image points tell of unknowns that
     # they share with other sources; as many image points have the weight of one with an error of its own
     design_effect: float = 1.0
+    balance: float = 1.0  # factor that its standard deviations have got to weigh it against other sources
     noun: str = ""  # what remarks call its image points; else its name
 
 

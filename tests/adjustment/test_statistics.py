@@ -22,13 +22,25 @@ from sfm.adjustment.quality.statistics import (
     tau_test,
     w_test,
 )
-from sfm.adjustment.quality.variance_components import by_camera, by_kind, by_photograph, estimate_components
+from sfm.adjustment.quality.variance_components import (
+    by_camera,
+    by_kind,
+    by_photograph,
+    by_source,
+    estimate_components,
+)
 from sfm.adjustment.result import Adjustment
 from sfm.adjustment.solve import AdjustmentOptions, adjust
 from sfm.model.camera import Camera, camera_from_values, pixel_from_tangents, tangents_from_pixel
 from sfm.model.conventions import FloatArray, rotation_from_vector
 from sfm.model.errors import GeometryError
-from sfm.model.network import ExteriorObservations, InteriorObservations, ObjectPoints, ScaleBars
+from sfm.model.network import (
+    ExteriorObservations,
+    InteriorObservations,
+    ObjectPoints,
+    ScaleBars,
+    Source,
+)
 from tests.synthetic import make_network, seed_of
 
 FREE = Datum("free")
@@ -383,3 +395,21 @@ def test_image_points_cover_their_convex_hull() -> None:
     for some in (triangle[:2], np.outer(np.arange(4.0), [1, 2])):
         area, inside = observed_part(some, places)
         assert area == 0 and not inside.any()
+
+
+def test_component_of_a_source_is_relative_to_what_was_stated_of_it() -> None:
+    """The weights of sources against one another already contain what their residuals show."""
+    network, truth = make_network(seed_of("balance"), images=12, points=60, visibility=0.9)
+    rng, seen = np.random.default_rng(seed_of("balance")), network.image_points
+    coarse = np.arange(len(seen)) % 2 == 1
+    xy = seen.xy + np.where(coarse[:, None], np.sqrt(3) * 0.1, 0.0) * rng.standard_normal(seen.xy.shape)
+    weighted = replace(
+        seen,
+        xy=xy,
+        covariance=np.where(coarse[:, None, None], 4.0, 1.0) * seen.covariance,
+        source=coarse.astype(np.int64),
+    )
+    sources = (Source("fine"), Source("coarse", balance=2.0))
+    network = replace(network, image_points=weighted, sources=sources)
+    components = by_source(adjust(network, truth, datum=FREE, reject="none"))
+    assert components.sigma0 == pytest.approx([1.0, 2.0], rel=0.12)

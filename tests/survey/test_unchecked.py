@@ -158,6 +158,17 @@ def test_fixed_control_is_held_against_the_free_network() -> None:
         assert not error or said[0].number("sigma") == pytest.approx(scatter, rel=0.4)
 
 
+def test_control_without_standard_deviations_is_compared_with_one_another() -> None:
+    """Their chi-square by the network alone, 1474 with 5 degrees of freedom, stood beside p = 0.53."""
+    network, truth = _scene("unknown standard deviations")
+    xyz = truth.points[:6] + 0.002 * seed_of("unknown").standard_normal((6, 3))
+    control = KnownPoints.from_arrays([str(k + 1) for k in range(6)], xyz)
+    result = run_survey(survey_of(network, truth, control=control, datum={"kind": "free"}))
+    (test,) = (said.tested for said in result.verdict.tests if said.kind == "given_tested")
+    assert test[2].startswith("standard deviations not stated, each compared with 5 others, 11 degrees")
+    assert "chi-square" not in test[2] and result.given_tests[0].probability > 0.01
+
+
 @pytest.mark.parametrize(("decimals", "kinds"), [(4, ("given_scatter",)), (None, ())])
 def test_fixed_control_is_weighted_as_it_scatters(decimals: int | None, kinds: tuple[str, ...]) -> None:
     """Of a network far more precise than 0.1 mm, without noise even; before, a warning."""

@@ -101,11 +101,16 @@ def by_camera(adjustment: Adjustment) -> VarianceComponents:
 def by_source(adjustment: Adjustment) -> VarianceComponents:
     """Return the variance factor of each source of image points.
 
+    It is relative to what was stated of the source, before sources got their weights against one another.
+
     Args:
         adjustment: finished adjustment.
     """
-    network = adjustment.network
-    return variance_components(adjustment, network.source, tuple(source.name for source in network.sources))
+    sources = adjustment.network.sources
+    of_weights = variance_components(
+        adjustment, adjustment.network.source, tuple(source.name for source in sources)
+    )
+    return replace(of_weights, sigma0=of_weights.sigma0 * [source.balance for source in sources])
 
 
 def by_kind(adjustment: Adjustment) -> VarianceComponents:

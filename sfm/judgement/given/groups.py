@@ -122,7 +122,10 @@ class Group:
     @property
     def test(self) -> GivenTest:
         """Test of all points."""
-        return GivenTest(self.of, self.judgement.statistic, self.judgement.dof, self.judgement.probability)
+        judged, model = self.judgement, self.placed.model
+        if model.estimated:
+            return GivenTest(self.of, None, judged.dof, judged.probability, model.items - 1)
+        return GivenTest(self.of, judged.statistic, judged.dof, judged.probability)
 
     def taking_part(self, *, rescale: bool) -> GivenPoints:
         """Return the points that take part, with their covariance in the adjustment."""

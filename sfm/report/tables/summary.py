@@ -235,7 +235,7 @@ def _consistency(findings: Findings) -> dict[str, Any]:
         "given_against_free_network": [
             {
                 "what": test.what,
-                "chi2": or_none(test.statistic),
+                "chi2": None if test.statistic is None else or_none(test.statistic),
                 "degrees_of_freedom": test.dof,
                 "probability": or_none(test.probability),
             }

@@ -510,12 +510,18 @@ def _balanced(network: Network, estimate: Estimate, min_rays: IntArray, settings
             effect = design_effect_of_neighbours(adjust_with(part, factors[part.source]), density=density)
     except GeometryError:  # the adjustment of the survey reports or repairs it
         return network
-    network = with_weights(network, shown)
+    weighted = with_weights(network, shown)
+    variance = np.trace(weighted.image_points.covariance, axis1=1, axis2=2)
+    balance = np.sqrt(variance / np.trace(network.image_points.covariance, axis1=1, axis2=2))
     sources = tuple(
-        replace(source, design_effect=effect) if source.has_common_errors else source
-        for source in network.sources
+        replace(
+            source,
+            balance=float(np.median(balance[rows])) if len(rows) else 1.0,
+            design_effect=effect if source.has_common_errors else source.design_effect,
+        )
+        for source, rows in zip(network.sources, rows_of(network.source, len(network.sources)), strict=True)
     )
-    return replace(network, sources=sources)
+    return replace(weighted, sources=sources)
 
 
 def _with_matching(

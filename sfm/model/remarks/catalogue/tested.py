@@ -75,7 +75,8 @@ ROWS = (
         "given_tested",
         "given values against the image points",
         "{of:@}",
-        "chi-square {chi2}, {dof} degrees of freedom, {p:<}",
+        "[[chi-square {chi2}]][[standard deviations not stated, each compared with {others} others]], {dof} "
+        "degrees of freedom, {p:<}",
     ),
     Tested("scale_unchecked", "given values", "{given:@bar}", "not tested: nothing else gives the scale"),
     Tested(
