@@ -56,7 +56,7 @@ def _pattern(sentence: str) -> str:
             return spec.split("|")[1]
         return f"{VARIES} {spec}s" if spec and spec[0].isalpha() else VARIES
 
-    alternatives = re.sub(r"\]\]\[\[(?=[A-Z{])", " / ", sentence)
+    alternatives = re.sub(r"\]\]\[\[(?=[A-Za-z{])", " / ", sentence)
     return FIELD.sub(field, alternatives.replace("[[", "").replace("]]", ""))
 
 

@@ -105,7 +105,7 @@ def readjust_cameras(
             free = corresponding_free(curve.former, curve.camera.model)
             free &= ~np.isin(curve.camera.names, form.held)
             freed[curve.camera.name] = replace(curve.camera, free=free, shared=())
-        anew = _adjusted(file.solution, freed)
+        anew = adjusted_with(file.solution, freed)
         of_anew = None if anew is None else cameras_of(anew.solution)
         if of_anew is not None:
             adjusted = {
@@ -157,7 +157,7 @@ def _radial_terms(form: Form) -> int:
     return len([name for name in names if name not in form.held])
 
 
-def _adjusted(solution: Solution, cameras: dict[str, Camera]) -> Adjustment | None:
+def adjusted_with(solution: Solution, cameras: dict[str, Camera]) -> Adjustment | None:
     """Return a new adjustment of a result with other cameras; None if it does not determine them.
 
     Args:

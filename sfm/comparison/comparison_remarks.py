@@ -75,6 +75,7 @@ def _remarks(comparison: ResultComparison) -> Iterator[Remark]:
     longest = np.linalg.norm(comparison.point_difference, axis=1)
     unit = comparison.unit or "object units"
     tested = int(np.isfinite(comparison.statistic).sum())
+    counted_points = {"tested": tested, "points": len(comparison.points)}
     if comparison.cause is not None:
         yield from remarks_of_cause(
             comparison.cause, first, second, len(comparison.points), (float(longest.max()), unit)
@@ -98,11 +99,20 @@ def _remarks(comparison: ResultComparison) -> Iterator[Remark]:
         if comparison.cause is None or comparison.untested.kind != "untestable":
             yield comparison.untested
     elif comparison.approximate:
-        yield remark("tested_singly")
+        yield remark("differences_tested", how="singly", **counted_points)
     elif tested <= MAX_POINTS < len(comparison.points):
-        yield remark("tested_part", tested=tested, points=len(comparison.points))
-    if comparison.changed and comparison.independent:
+        yield remark("differences_tested", how="jointly", **counted_points)
+    too_lean = any(weakness.camera is not None for weakness in comparison.weaker)
+    if comparison.changed and comparison.independent and not too_lean:
         yield from _remarks_on_cameras(comparison)
+    for weakness in comparison.weaker:
+        between = {"weaker": weakness.name, "of": weakness.of}
+        if weakness.sigma_px is not None:
+            sigmas = {"theirs": (weakness.sigma_px, "px"), "ours": (weakness.of_sigma_px, "px")}
+            yield remark("weaker_solution", **sigmas, **between)
+        if weakness.camera is not None:
+            fits = {"fits": (weakness.with_model_px, "px"), "own": (weakness.own_px, "px")}
+            yield remark("weaker_solution", model=weakness.model, camera=weakness.camera, **fits, **between)
 
 
 def _remarks_on_cameras(comparison: ResultComparison) -> Iterator[Remark]:

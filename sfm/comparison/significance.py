@@ -32,6 +32,7 @@ from sfm.comparison.pairing import (
 )
 from sfm.comparison.solutions import rotation_angle_deg
 from sfm.comparison.stable_points import critical_value
+from sfm.comparison.weaker_solution import Weakness, weaker_solutions
 from sfm.model.arguments import checked_arguments
 from sfm.model.conventions import METRES, BoolArray, FloatArray, IntArray
 from sfm.model.display import html_table, text_table
@@ -90,6 +91,7 @@ class ResultComparison:
     position_difference: FloatArray  # of projection centres, object unit of a, (m, 3)
     rotation_deg: FloatArray  # angle between the rotations, deg, (m,)
     interior: tuple[InteriorDifference, ...]  # of cameras that share photographs
+    weaker: tuple[Weakness, ...] = ()  # why one of them is the weaker solution of the same photographs
 
     @property
     def independent(self) -> bool:
@@ -208,6 +210,7 @@ def compare_results(
         position_difference=moved.position[ib] - a.estimate.position[ia],
         rotation_deg=rotation_angle_deg(a.estimate.rotation[ia], moved.rotation[ib]),
         interior=_interior(a, b, ia, ib),
+        weaker=weaker_solutions(a, b, pairing),
     )
 
 

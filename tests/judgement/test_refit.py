@@ -44,7 +44,12 @@ def held(name: str, a: Adjustment) -> Alternative:
 
 
 def rounds(
-    a: Adjustment, monkeypatch: pytest.MonkeyPatch, gains: list[float], most: int, adjustments: int = 1
+    a: Adjustment,
+    monkeypatch: pytest.MonkeyPatch,
+    gains: list[float],
+    most: int,
+    adjustments: int = 1,
+    asked: float = -np.inf,
 ) -> tuple[int, Refit | None]:
     """Return how many rounds a refit takes whose further steps gain so much of v'Pv, and the refit."""
     taken = []
@@ -56,7 +61,7 @@ def rounds(
     left = iter(gains)
     monkeypatch.setattr(refitting, "_stepped", stepped)
     monkeypatch.setattr(refitting, "gain_of", lambda *_: Gain(next(left), 1, np.full(1, 0.5)))
-    found = refit(a, held("K1", a), a, most=most)
+    found = refit(a, held("K1", a), a, asked=asked, most=most)
     return len(taken), found
 
 
@@ -288,3 +293,12 @@ def test_what_other_causes_explain_is_no_spread_of_photographs() -> None:
     expected = np.square(slope).sum() / (along @ along) * 12 / 11
     assert spread_of_photographs(found, one, [others]) == pytest.approx(expected)
     assert spread_of_photographs(found, one, []) != pytest.approx(expected)
+
+
+@pytest.mark.parametrize(("asked", "expected"), [(-np.inf, 3), (4.0, 3), (12.0, 2)])
+def test_rounds_end_where_the_gain_that_is_asked_for_is_out_of_reach(
+    a: Adjustment, monkeypatch: pytest.MonkeyPatch, asked: float, expected: int
+) -> None:
+    """The rounds stay at a gain of 0, and a further step promises 9."""
+    count, found = rounds(a, monkeypatch, [9.0, 9.0, 0.0], most=24, asked=asked)
+    assert count == expected and found is not None and found.finished

@@ -224,15 +224,16 @@ def test_earlier_causes_stay_while_the_others_do_not_explain_them(
     first, second = causes_of(a, 2)
     new = Cause(alternative("moved"), replace(refitted(a), before=(np.full(1, 20.0), np.full(1, 21.0))), ())
     limit = 5.0 + np.log(1 / a.levels.family)
-    asked: list[list[float]] = []
+    tried: list[list[float]] = []
 
     def without(losses: dict[float, float]) -> Callable[..., Refit]:
         def alone(
-            plain: Adjustment, one: Alternative, start: Adjustment, others: Any, *, least: float
+            plain: Adjustment, one: Alternative, start: Adjustment, others: Any, *, least: float, asked: float
         ) -> Refit:
             assert least == -np.inf  # without a cause, likelihood is lost
+            assert asked == pytest.approx(-limit)  # the rounds end where it cannot rise to that
             kept = {other.search for other, _ in others}
-            asked.append([float(beta[0]) for _, beta in others])
+            tried.append([float(beta[0]) for _, beta in others])
             left = 0.0 if kept == {1.0} else 1.0
             before = tuple(beta for _, beta in others)
             return replace(refitted(a), gain=-losses[left], before=before)
@@ -245,7 +246,7 @@ def test_earlier_causes_stay_while_the_others_do_not_explain_them(
         2
     ].alternative is new.alternative
     assert [float(one.refit.beta[0]) for one in kept[:2]] == [20.0, 21.0]  # as adjusted with the new one
-    assert asked == [[21.0], [20.0]]
+    assert tried == [[21.0], [20.0]]
     monkeypatch.setattr(hypotheses, "refit", without({0.0: limit - 0.1, 1.0: limit + 0.1}))
     kept = hypotheses._still_needed(a, (first, second), new)
     assert [one.alternative.search for one in kept[:-1]] == [1.0]

@@ -121,9 +121,10 @@ def test_comparison_is_written_with_every_point(
     assert summary["significant"] == ["5"] and summary["changed"] is True
     page = path.read_text(encoding="utf-8")
     verdict = verdict_of_comparison(moved[0])
-    (said,), (approximate,) = verdict.remarks, verdict.tests
+    (said, weaker), (approximate,) = verdict.remarks, verdict.tests
+    assert weaker.kind == "weaker_solution" and weaker.names("weaker") == ("after <b>",)
     assert (
-        approximate.kind == "tested_singly"
+        approximate.kind == "differences_tested"
         and said.kind == "points_differ"
         and said.names("points") == ("5",)
         and bound(said.text) in page

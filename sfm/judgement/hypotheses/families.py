@@ -121,6 +121,12 @@ class Alternative:
             return gain
         return log_likelihood_gain(squares_gained(gain, redundancy) / self.design_effect, redundancy)
 
+    def inflated(self, gain: float, redundancy: int) -> float:
+        """Return the gain of ln likelihood that is deflated to a given one."""
+        if self.design_effect == 1:
+            return gain
+        return log_likelihood_gain(squares_gained(gain, redundancy) * self.design_effect, redundancy)
+
 
 @dataclass(frozen=True)
 class Family(ABC):

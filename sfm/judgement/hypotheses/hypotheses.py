@@ -272,21 +272,29 @@ def _best(
     to_try = _to_adjust(every, level)
     work = max(len(to_try), 1) * len(plain.network.images) ** 3
 
-    def judged(alternative: Alternative, refitted: Refit) -> _Adjusted:
-        beyond = _beyond_spread(alternative, refitted, reduced.redundancy, before) if causes else np.inf
-        gain = min(alternative.deflated(refitted.gain, reduced.redundancy), beyond)
-        return _Adjusted(gain - alternative.price, alternative, refitted)
+    def judge(alternative: Alternative, refitted: Refit, asked: float) -> None:
+        evidence = alternative.deflated(refitted.gain, reduced.redundancy) - alternative.price
+        if causes and evidence >= asked:
+            beyond = _beyond_spread(alternative, refitted, reduced.redundancy, before)
+            evidence = min(evidence, beyond - alternative.price)
+        holding.append(_Adjusted(evidence, alternative, refitted))
 
-    def adjusted(alternatives: Iterable[Alternative]) -> list[_Adjusted]:
+    def least_asked() -> float:
+        """Return the least evidence of an alternative that is named, or that explains as much."""
+        return float(max([np.log(1 / level), *(tried.evidence for tried in holding)]) - MIN_LEAD)
+
+    def adjust_all(alternatives: Iterable[Alternative]) -> None:
         most = int(MAX_WORK / work)
-        refits = [
-            (alternative, refit(plain, alternative, current, before, most=most))
-            for alternative in alternatives
-        ]
-        return [judged(alternative, refitted) for alternative, refitted in refits if refitted is not None]
+        for alternative in alternatives:
+            asked = least_asked()
+            refitted = refit(plain, alternative, current, before, asked=asked + alternative.price, most=most)
+            if refitted is not None:
+                judge(alternative, refitted, asked)
 
-    holding = adjusted(reported("alternatives adjusted", to_try, len(to_try)))
-    holding += [judged(alternative, refitted) for alternative, refitted in beside]
+    holding: list[_Adjusted] = []
+    for alternative, refitted in beside:
+        judge(alternative, refitted, least_asked())
+    adjust_all(reported("alternatives adjusted", to_try, len(to_try)))
     best = max(holding, key=attrgetter("evidence"), default=None)
     if best is None or not best.evidence > np.log(1 / level):
         return None
@@ -301,7 +309,7 @@ def _best(
         for alternative in reversed(every)
         if alternative.evidence_beside_spread > near
     }
-    holding += adjusted([rival for kind, rival in rivals.items() if kind not in tried])
+    adjust_all([rival for kind, rival in rivals.items() if kind not in tried])
     as_well = tuple(
         (other.alternative, other.refit)
         for other in holding
@@ -390,11 +398,10 @@ def _still_needed(plain: Adjustment, causes: tuple[Cause, ...], latest: Cause) -
         before = [(known, beta) for known, beta in joint if known is not cause]
         new = replace(latest.alternative, gain=replace(latest.alternative.gain, beta=latest.refit.beta))
         others = [(known.alternative, beta) for known, beta in before]
-        alone = refit(plain, new, latest.refit.adjustment, others, least=-np.inf)  # it loses
-        if alone is None:
-            continue
-        gain = cause.alternative.deflated(-alone.gain, plain.redundancy)
-        if gain - cause.alternative.price < np.log(1 / plain.levels.family):
+        price = cause.alternative.price + np.log(1 / plain.levels.family)
+        loss = cause.alternative.inflated(price, plain.redundancy)  # with so much, it is needed
+        alone = refit(plain, new, latest.refit.adjustment, others, least=-np.inf, asked=-loss)
+        if alone is not None and -alone.gain < loss:
             causes, latest = tuple(known for known, _ in before), replace(latest, refit=alone)
     joint = zip(causes, latest.refit.before, strict=True)
     kept = tuple(replace(known, refit=replace(known.refit, beta=beta)) for known, beta in joint)

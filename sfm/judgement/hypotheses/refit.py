@@ -86,6 +86,7 @@ def refit(
     before: Sequence[tuple[Alternative, FloatArray]] = (),
     *,
     least: float = 0.0,
+    asked: float = -np.inf,
     most: int = ROUNDS * HALVINGS,
 ) -> Refit | None:
     """Adjust with an alternative; None if the adjustment does not converge.
@@ -95,7 +96,8 @@ def refit(
         alternative: what is adjusted in addition.
         start: adjustment to start from, of image points without the effect of earlier alternatives.
         before: earlier alternatives with their parameters, which are adjusted jointly.
-        least: gain of ln likelihood that is asked for; the rounds end when it is out of reach.
+        least: gain of ln likelihood below which a step is halved.
+        asked: gain of ln likelihood that is asked for; the rounds end when it is out of reach.
         most: number of adjustments after which no further round begins.
     """
     every = [other for other, _ in before] + [alternative]
@@ -119,7 +121,7 @@ def refit(
         D = _side_by_side(every, current, reduced.columns)
         gain = gain_of(*reduced.project(reduced.whiten(D)), least_share(D.shape[2]))
         # even with the next step; the first one may be far off, with image points rejected that return
-        out_of_reach = number > 0 and likelihoods[-1] + gain.value < before_all + least
+        out_of_reach = number > 0 and likelihoods[-1] + gain.value < before_all + max(least, asked)
         finished = out_of_reach or gain.value < LAST_GAIN or number == ROUNDS - 1
         if finished or taken >= most:
             break

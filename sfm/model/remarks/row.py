@@ -59,6 +59,8 @@ NOUNS = {  # subjects of remarks, by their names in the data
     "diameters": "the targets with given diameters",
     "observations": "the survey observations",
     "covariance": "covariances",
+    "jointly": "those whose joint covariance both results store",
+    "singly": "approximate: the covariance between points is not known",
     "sigmas": "standard deviations",
     "steadily": "steadily through the sequence",
     "alike": "at the same values",

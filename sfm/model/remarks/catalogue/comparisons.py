@@ -138,6 +138,15 @@ ROWS = (
         "Adjust both with per_photograph for the parameters, and compare again.",
     ),
     Kind(
+        "weaker_solution",
+        "note",
+        "{weaker} is weaker than {of}. [[The standard deviation of its image points is {theirs}, that of "
+        "{of} {ours}]][[Its {model} model is too lean for camera {camera}: with it, the standard deviation "
+        "of the image points of {of} is {fits} in place of {own}]].",
+        "photographs, targets or texture that are measured less precisely, or too few terms of distortion",
+        "Believe {of}; give {weaker} more precise image points, or a camera model with more terms.",
+    ),
+    Kind(
         "same_image_points",
         "warning",
         "Not tested: {share:%} of the image points of {first} are also those of {second}.",

@@ -75,8 +75,8 @@ ROWS = (
         "given_tested",
         "given values against the image points",
         "{of:@}",
-        "[[chi-square {chi2}]][[standard deviations not stated, each compared with {others} others]], {dof} "
-        "degrees of freedom, {p:<}",
+        "[[chi-square {chi2}, {dof} degrees of freedom, {p:<}]][[standard deviations not stated, each "
+        "compared with {others} others, {p:<}]]",
     ),
     Tested("scale_unchecked", "given values", "{given:@bar}", "not tested: nothing else gives the scale"),
     Tested(
@@ -126,16 +126,10 @@ ROWS = (
     ),
     Tested("not_compared", "{what:@}", "the survey", "not compared: {reason}"),
     Tested(
-        "tested_part",
+        "differences_tested",
         "significance of the differences",
         "{tested} of {points} points",
-        "those whose joint covariance both results store",
-    ),
-    Tested(
-        "tested_singly",
-        "significance of the differences",
-        "each point",
-        "approximate: the covariance between points is not known",
+        "{how:@}",
     ),
     Tested(
         "one_camera",
