@@ -9,6 +9,7 @@ import cv2
 import numpy as np
 import pycolmap
 import pytest
+from scipy.spatial.transform import Rotation
 
 from adapters.colmap import adjuster as colmap
 from adapters.colmap.adjuster import adjust_with_colmap, covariance_with_colmap
@@ -18,6 +19,7 @@ from sfm.adjustment.datum import Datum
 from sfm.adjustment.solve import adjust
 from sfm.comparison.solutions import reprojection
 from sfm.model.camera import camera_from_values
+from sfm.model.conventions import angles_from_rotation, rotation_from_angles, skew
 from sfm.model.errors import BackendError, OutputError, SurveyFileError
 from sfm.model.estimate import Estimate
 from sfm.model.network import Network, ObjectPoints
@@ -158,6 +160,37 @@ def test_control_is_held() -> None:
     weighted = replace(control, covariance=np.tile(np.eye(3) * 1e-6, (4, 1, 1)))
     with pytest.raises(BackendError, match="control with standard deviations"):
         adjust_with_colmap(network.with_given(weighted), start, gauge="control")
+
+
+def test_covariance_of_poses_is_that_of_colmap_in_the_same_gauge() -> None:
+    """COLMAP's is of delta and t for R' = exp(2 delta) R, x_camera = R X + t, with five points held."""
+    network, truth = scene()
+    network = network.with_given(ObjectPoints(np.arange(5), truth.points[:5], np.zeros((5, 3, 3))))
+    a = adjust(network, truth, datum=Datum("control"), reject="none")
+    backend = colmap.load_pycolmap()
+    free = colmap.colmap_free(a.estimate.cameras)
+    options = colmap.ceres_options(backend, free, len(network.images), 1, 1)
+    model = colmap.reconstruction(backend, network, a.estimate)
+    config = colmap.adjustment_config(backend, network, a.estimate, "control")
+    adjuster = backend.create_default_ceres_bundle_adjuster(options, config, model)
+    wanted = backend.BACovarianceOptions()
+    wanted.damping = 0.0
+    covariances = backend.estimate_ba_covariance(wanted, model, adjuster)
+    step = 1e-6
+    for i, ours in enumerate(a.covariance.exterior / (a.sigma0 * a.sigma_px) ** 2):
+        pose = model.image(i + 1).cam_from_world()
+        R, t = pose.rotation.matrix(), pose.translation
+        to_ours = np.zeros((6, 6))  # dX0 = -R'dt - 2 R'[t] delta; turn in the object system -2 R'delta
+        to_ours[:3, 3:], to_ours[:3, :3], to_ours[3:, :3] = -R.T, -2 * R.T @ skew(t), -2 * R.T
+        angles = angles_from_rotation(a.estimate.rotation[i])
+        of_angles = np.eye(6)  # turn in the object system by each angle, from central differences
+        for k, shift in enumerate(step * np.eye(3)):
+            turned = rotation_from_angles(*(angles + shift)) @ rotation_from_angles(*(angles - shift)).T
+            of_angles[3:, 3 + k] = Rotation.from_matrix(turned).as_rotvec() / (2 * step)
+        theirs = to_ours @ np.array(covariances.get_cam_cov_from_world(i + 1)) @ to_ours.T
+        ours = of_angles @ ours @ of_angles.T
+        sigma = np.sqrt(np.diagonal(theirs))
+        np.testing.assert_allclose(ours / np.outer(sigma, sigma), theirs / np.outer(sigma, sigma), atol=1e-6)
 
 
 def test_principal_point_is_free_only_when_asked() -> None:
