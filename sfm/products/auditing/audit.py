@@ -19,7 +19,7 @@ from sfm.adjustment.datum import Datum
 from sfm.judgement.checks import root_mean_square
 from sfm.judgement.survey_result import SurveyResult
 from sfm.model.camera import pixel_from_rays
-from sfm.model.conventions import MAD_TO_SIGMA, METRES, FloatArray, angles_from_rotation
+from sfm.model.conventions import MAD_TO_SIGMA, METRES, FloatArray, IntArray, angles_from_rotation
 from sfm.model.display import counted, listed
 from sfm.model.errors import GeometryError
 from sfm.model.network import rows_of
@@ -42,6 +42,7 @@ class Stated:
     """What a model states of itself, by its own projection of its points."""
 
     residuals: FloatArray  # computed minus measured, px, (k, 2)
+    point: IntArray  # object point of each, (k,)
     unseen: int  # further image points, of points that their camera does not see where the model has both
     photographs: int  # with an orientation
     points: int  # with coordinates
@@ -56,6 +57,11 @@ class Stated:
     def mean_length_px(self) -> float:
         """Mean length of the residual vectors, px, which many programs call mean reprojection error."""
         return float(np.linalg.norm(self.residuals, axis=1).mean())
+
+    @property
+    def mean_of_points_px(self) -> float:
+        """Mean over the points of the mean length of their residual vectors, px, COLMAP's mean error."""
+        return mean_of_points(self.residuals, self.point)
 
     @property
     def sigma_px(self) -> float:
@@ -89,6 +95,18 @@ class Audit:
     like: tuple[LikeCameras, ...] = ()  # cameras that could be one
 
 
+def mean_of_points(residuals: FloatArray, point: IntArray) -> float:
+    """Return the mean over the points of the mean length of their residual vectors.
+
+    Args:
+        residuals: of image points, (k, 2).
+        point: object point of each, (k,).
+    """
+    count = np.bincount(point)
+    length = np.bincount(point, np.linalg.norm(residuals, axis=1))
+    return float((length[count > 0] / count[count > 0]).mean())
+
+
 def stated_of(model: Solution) -> Stated:
     """Return what a model states of itself.
 
@@ -104,7 +122,8 @@ def stated_of(model: Solution) -> Stated:
     of_camera = rows_of(network.camera[seen.image], len(estimate.cameras))
     for camera, rows in zip(estimate.cameras, of_camera, strict=True):
         residuals[rows] = pixel_from_rays(camera, rays[rows]) - seen.xy[rows]
-    residuals = residuals[np.isfinite(residuals).all(axis=1)]
+    known = np.isfinite(residuals).all(axis=1)
+    residuals = residuals[known]
     if not len(residuals):
         raise GeometryError(
             "audit: no image points of oriented photographs and of points with coordinates, or that two "
@@ -117,6 +136,7 @@ def stated_of(model: Solution) -> Stated:
     unknowns = 6 * len(np.unique(seen.image)) + 3 * len(np.unique(seen.point)) - DATUM
     return Stated(
         residuals,
+        seen.point[known],
         len(seen) - len(residuals),
         int(estimate.oriented.sum()),
         int(estimate.determined.sum()),

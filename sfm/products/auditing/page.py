@@ -14,7 +14,7 @@ from sfm.model.conventions import FloatArray
 from sfm.model.display import counted, listed
 from sfm.model.network import rows_of
 from sfm.model.remarks.verdict import Level
-from sfm.products.auditing.audit import Audit
+from sfm.products.auditing.audit import Audit, mean_of_points
 from sfm.report.given_residuals import given_parts
 from sfm.report.page import Column, Note, Page, Paragraph, Part, Section, Table, columns, tested_section
 from sfm.report.phrases import fixed, general, significant
@@ -78,6 +78,7 @@ def _figures(audit: Audit, unit: str) -> Iterator[Part]:
         for covariance in (own.points, own.exterior[:, :3, :3])
     )
     mean = float(np.linalg.norm(v, axis=1).mean())
+    of_points = mean_of_points(v, a.network.image_points.point[~a.rejected])
     yield Table(
         columns("", ">the model", ">adjusted here"),
         [
@@ -87,6 +88,11 @@ def _figures(audit: Audit, unit: str) -> Iterator[Part]:
             *([("Image points of points or photographs that are left out", "", lost)] if lost else []),
             ("RMS residual per coordinate [px]", general(stated.rms_px, 4), general(a.rms_px, 4)),
             ("Mean length of a residual [px]", general(stated.mean_length_px, 4), general(mean, 4)),
+            (
+                "Mean over points of their residuals' lengths [px]",
+                general(stated.mean_of_points_px, 4),
+                general(of_points, 4),
+            ),
             ("Standard deviation of an image coordinate [px]", "not stated", general(a.sigma0_px, 4)),
             (f"Standard deviation of a point, RMS [{unit}]", sigma_points, points),
             (f"Standard deviation of a station, RMS [{unit}]", sigma_stations, stations),
@@ -102,9 +108,10 @@ def _figures(audit: Audit, unit: str) -> Iterator[Part]:
     share = a.redundancy / (2 * len(v))
     yield Note(
         "The model's residuals are those of its own cameras, photographs and points. The mean length of a "
-        "residual is what many programs call mean reprojection error: it says how well the model fits, not "
-        f"how precise it is. Of {2 * len(v)} image coordinates {a.redundancy} are redundant, "
-        f"{fixed(share, 2)} each; the standard deviation of an image coordinate takes this into account."
+        "residual is what many programs call mean reprojection error; COLMAP's is the mean over points. "
+        f"Both say how well the model fits, not how precise it is. Of {2 * len(v)} image coordinates "
+        f"{a.redundancy} are redundant, {fixed(share, 2)} each; the standard deviation of an image coordinate "
+        "takes this into account."
     )
 
 

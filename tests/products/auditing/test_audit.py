@@ -8,8 +8,9 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from adapters.colmap.adjuster import load_pycolmap
 from adapters.formats.content import Content
-from adapters.formats.registry import write_content
+from adapters.formats.registry import read_comparable, write_any, write_content
 from sfm.adjustment.quality.correlations import OrientationCorrelation
 from sfm.model.camera import pixel_from_rays
 from sfm.model.errors import GeometryError
@@ -49,6 +50,19 @@ def model_of(network: Network, truth: Estimate, *, off: float = 0.0) -> Solution
 def audited(model: Solution, **how: object) -> Audit:
     stated = stated_of(model)
     return audit_of(model, stated, run_survey(survey_of_model(model, stated, **how)[0]))  # type: ignore[arg-type]
+
+
+def test_what_colmap_states_of_its_model_is_on_the_page(tmp_path: Path) -> None:
+    """Its mean reprojection error is a mean over points of means over their image points."""
+    network, truth = make_network(
+        seed_of("stated"), images=8, points=40, noise_px=NOISE_PX, model="opencv", visibility=0.6
+    )
+    write_any(tmp_path / "model", "colmap", network, truth)
+    theirs = load_pycolmap().Reconstruction(str(tmp_path / "model"))
+    theirs.update_point_3d_errors()
+    stated = stated_of(read_comparable(tmp_path / "model"))
+    assert stated.mean_of_points_px == pytest.approx(theirs.compute_mean_reprojection_error(), abs=1e-9)
+    assert abs(stated.mean_of_points_px - stated.mean_length_px) > 1e-3  # as rays of points differ in number
 
 
 def test_a_model_is_adjusted_to_what_its_image_points_tell() -> None:
