@@ -33,6 +33,7 @@ from pydantic import (
     ValidationError,
 )
 
+from sfm.model.conventions import AnyArray
 from sfm.model.errors import SurveyFileError
 
 MAX_TOML_BYTES = 1_000_000  # people write such files; a larger file is something else
@@ -103,10 +104,28 @@ def csv_blocks(header: Sequence[str], rows: Iterable[Sequence[object]]) -> Itera
     yield ",".join(map(_quoted, header)) + "\n"
     rows = iter(rows)
     while block := list(islice(rows, BLOCK)):
-        columns = [_column(values) for values in zip(*block, strict=True)]
-        if len(columns) == 1:
-            columns = [[cell or '""' for cell in columns[0]]]  # an empty line would not be a row
-        yield "\n".join(map(",".join, zip(*columns, strict=True))) + "\n"
+        yield _block([_column(values) for values in zip(*block, strict=True)])
+
+
+def csv_blocks_of_columns(
+    header: Sequence[str], columns: Sequence[Sequence[object] | AnyArray]
+) -> Iterator[str]:
+    """Yield a table as CSV in blocks of rows, from its columns, see `csv_blocks`.
+
+    Args:
+        header: names of the columns.
+        columns: values of each column, as many in each.
+    """
+    yield ",".join(map(_quoted, header)) + "\n"
+    for first in range(0, len(columns[0]) if columns else 0, BLOCK):
+        yield _block([_column(values[first : first + BLOCK]) for values in columns])
+
+
+def _block(columns: list[list[str]]) -> str:
+    """Return rows of cells as lines of CSV."""
+    if len(columns) == 1:
+        columns = [[cell or '""' for cell in columns[0]]]  # an empty line would not be a row
+    return "\n".join(map(",".join, zip(*columns, strict=True))) + "\n"
 
 
 def is_word(text: str) -> bool:
@@ -148,8 +167,12 @@ def as_plain(text: str) -> str:
     return _HIDDEN.sub(lambda hidden: ascii(hidden[0])[1:-1].replace("\\udc", "\\x"), text)
 
 
-def _column(values: Sequence[object]) -> list[str]:
+def _column(values: Sequence[object] | AnyArray) -> list[str]:
     """Return the cells of a column."""
+    if isinstance(values, np.ndarray):
+        if values.dtype.kind == "f" and np.isfinite(values).all():
+            return list(map(repr, values.tolist()))
+        values = values.tolist()
     kinds = set(map(type, values))
     if kinds == {float}:
         numbers = cast(Sequence[float], values)

@@ -25,8 +25,15 @@ from typing import Any
 import numpy as np
 
 from sfm.files.csv_tables import CsvTable, read_header, read_table
-from sfm.files.plain_text import csv_blocks, csv_text
-from sfm.model.conventions import BoolArray, FloatArray, IntArray, angles_from_rotation, rotation_from_angles
+from sfm.files.plain_text import csv_blocks, csv_blocks_of_columns, csv_text
+from sfm.model.conventions import (
+    AnyArray,
+    BoolArray,
+    FloatArray,
+    IntArray,
+    angles_from_rotation,
+    rotation_from_angles,
+)
 from sfm.model.errors import SurveyFileError
 from sfm.model.estimate import Mounts
 from sfm.model.network import ImagePoints, Network
@@ -106,26 +113,30 @@ class ResultTable:
                 for a single column; None leaves the group out.
         """
         header: list[str] = []
-        columns: list[Sequence[object]] = []
+        columns: list[Sequence[object] | AnyArray] = []
         for (_, names), value in zip(self.groups, values, strict=True):
             if value is not None:
-                if isinstance(value, np.ndarray):
-                    value = value.T.tolist() if value.ndim == 2 else value.tolist()
-                of_group = [value] if len(names) == 1 else list(value) or [()] * len(names)
+                if isinstance(value, np.ndarray) and value.ndim == 2:
+                    value = np.ascontiguousarray(value.T)
+                alone = len(names) == 1 and not (isinstance(value, np.ndarray) and value.ndim == 2)
+                of_group = [value] if alone else list(value) or [()] * len(names)
                 if len(of_group) != len(names):
                     wrong = f"{len(of_group)} columns of values for {len(names)} columns of the table"
                     raise ValueError(wrong)
                 header += names
                 columns += of_group
-        self._save(folder, header, zip(*columns, strict=True))
+        rows = {len(column) for column in columns}
+        if len(rows) > 1:
+            raise ValueError(f"columns of {', '.join(map(str, sorted(rows)))} rows in one table")
+        self._save(folder, csv_blocks_of_columns(header, columns))
 
     def write_rows(self, folder: Path, rows: Iterable[Sequence[object]]) -> None:
         """Write the table of a result from rows with all columns."""
-        self._save(folder, self.names_of(), rows)
+        self._save(folder, csv_blocks(self.names_of(), rows))
 
-    def _save(self, folder: Path, header: Sequence[str], rows: Iterable[Sequence[object]]) -> None:
+    def _save(self, folder: Path, blocks: Iterable[str]) -> None:
         with (folder / self.file).open("w", encoding="utf-8", newline="") as file:
-            file.writelines(csv_blocks(header, rows))
+            file.writelines(blocks)
 
 
 EXTERIOR = "X0 Y0 Z0 omega phi kappa"

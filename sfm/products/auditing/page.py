@@ -108,10 +108,10 @@ def _figures(audit: Audit, unit: str) -> Iterator[Part]:
     share = a.redundancy / (2 * len(v))
     yield Note(
         "The model's residuals are those of its own cameras, photographs and points. The mean length of a "
-        "residual is what many programs call mean reprojection error; COLMAP's is the mean over points. "
-        f"Both say how well the model fits, not how precise it is. Of {2 * len(v)} image coordinates "
-        f"{a.redundancy} are redundant, {fixed(share, 2)} each; the standard deviation of an image coordinate "
-        "takes this into account."
+        "residual is what many programs call mean reprojection error; COLMAP's is that over points. They "
+        f"say how well the model fits, not how precise it is. Of {2 * len(v)} image coordinates "
+        f"{a.redundancy} are redundant, {fixed(share, 2)} each; the standard deviation of an image "
+        "coordinate takes this into account."
     )
 
 

@@ -14,7 +14,6 @@ from sfm.adjustment.result import Adjustment
 from sfm.files import result_tables as tables
 from sfm.files.covariance_file import write_covariances
 from sfm.files.csv_tables import write_ply
-from sfm.files.plain_text import BLOCK
 from sfm.files.result_tables import MOMENTS, MOUNTS, write_rigs
 from sfm.judgement.bundle_statistics import Statistics
 from sfm.judgement.survey_result import SurveyResult
@@ -51,7 +50,7 @@ def write_tables(findings: Findings, folder: Path, colours: AnyArray | None = No
     tables.write_solution(folder, result.solution, a.network.image_points, a.rejected, *further)
     tables.LEFT_OUT.write_rows(folder, left_out_rows(result))
     tables.GIVEN.write_rows(folder, given_rows(findings.given.kinds, result.network, result.unit))
-    tables.RELIABILITY.write_rows(folder, reliability_rows(a, statistics))
+    write_reliability(folder, a, statistics)
     tables.VARIANCE_COMPONENTS.write_rows(folder, component_rows(statistics))
     tables.RESIDUALS.write_rows(folder, findings.protocol.residuals)
     tables.CONTROL_POINTS.write_rows(folder, findings.protocol.control)
@@ -157,36 +156,24 @@ def left_out_rows(result: SurveyResult) -> Iterable[Sequence[Any]]:
         yield ("point", point.point, point.image_points, point.reason.text)
 
 
-def reliability_rows(adjustment: Adjustment, statistics: Statistics) -> Iterable[Sequence[object]]:
-    """Return the tests of every image point: residual, redundancy number, w, tau, minimal bias, its effect.
+def write_reliability(folder: Path, a: Adjustment, statistics: Statistics) -> None:
+    """Write the tests of every image point: residual, redundancy number, w, tau, minimal bias, its effect.
 
     Rejected image points have empty cells instead of redundancy number and reliability. So have image points
     with a redundancy number of 0, since no error in them is detected.
     """
-    network = adjustment.network
-    a, reliability = adjustment, statistics.reliability
-    tests = (
-        a.residuals,
-        a.redundancy_numbers,
-        a.standardised,
-        a.tau,
-        reliability.minimal_bias,
-        reliability.external,
-    )
+    network, reliability = a.network, statistics.reliability
+    seen = network.image_points
     checked = a.redundancy_numbers > MIN_CHECKED_REDUNDANCY
     error = np.where(checked, a.residuals / np.where(checked, a.redundancy_numbers, 1.0), np.nan)
-    seen = network.image_points
-    columns = (*tests, a.weights, error)
-    for first in range(0, len(seen), BLOCK):
-        part = slice(first, first + BLOCK)
-        for i, j, values, rejected in zip(
-            seen.image[part].tolist(),
-            seen.point[part].tolist(),
-            np.column_stack([column[part] for column in columns]).tolist(),
-            a.rejected[part].tolist(),
-            strict=True,
-        ):
-            yield (network.images[i], network.points[j], *values[:-2], int(rejected), *values[-2:])
+    tests = (a.tau, reliability.minimal_bias, reliability.external, a.weights)
+    tables.RELIABILITY.write(
+        folder,
+        [[network.images[i] for i in seen.image.tolist()], [network.points[j] for j in seen.point.tolist()]],
+        np.column_stack([a.residuals, a.redundancy_numbers]),
+        a.standardised,
+        [*np.column_stack(tests).T, a.rejected.astype(np.int64), *error.T],
+    )
 
 
 def component_rows(statistics: Statistics) -> Iterable[Sequence[Any]]:

@@ -14,6 +14,8 @@ from adapters.formats.registry import FORMATS, format_named, read_content, write
 from sfm.adjustment.result import Adjustment
 from sfm.adjustment.solve import adjust
 from sfm.cli.commands.convert import convert
+from sfm.model.camera import Camera
+from sfm.model.distortion.models import Role
 from sfm.model.errors import SurveyFileError
 from sfm.model.network import (
     ExteriorObservations,
@@ -25,9 +27,11 @@ from sfm.model.network import (
 from sfm.model.solution import Solution
 from sfm.pipeline import run_survey
 from sfm.survey.inputs.survey import read_survey
+from tests.rigs import make_rig
 from tests.synthetic import make_network, seed_of
 
 READABLE = tuple(form.name for form in FORMATS if form.readable and form.writable)
+SEVERAL = tuple(name for name in READABLE if not name.startswith("bundle-"))  # of more than one camera
 MODEL_OF = {"bal": "radial", "photomodeler": "brown_dbat", "metashape": "opencv", "sba": "opencv"}
 MODEL_OF |= {"opensfm": "opencv", "nerfstudio": "opencv", "alicevision": "opencv", "bundler": "radial"}
 MODEL_OF |= {"nvm": "brown", "openmvg": "brown_forward", "micmac": "brown_forward"}
@@ -46,31 +50,29 @@ def covariances(rng: np.random.Generator, count: int, size: int, *, diagonal: bo
     return C * np.eye(size) if diagonal else C
 
 
+def model_of(form: str) -> str:
+    return MODEL_OF.get(form, "brown" if form.startswith("bundle") else "full_opencv")
+
+
+def lens_of(form: str, camera: Camera) -> Camera:
+    """A camera without what a format cannot hold of its model."""
+    focal = camera.plays(*[role for role in Role if "FOCAL" in role.name])
+    centre = {"cx": 999.5, "cy": 749.5}
+    names, values = camera.names, camera.parameters
+    if form in ("sba", "bundle-matlab", "bundle-csharp"):
+        rows = zip(names, values, focal, strict=True)
+        values = np.array([value if kept else centre.get(name, 0.0) for name, value, kept in rows])
+    if form == "photomodeler":
+        values = np.where(np.isin(names, ["b1", "b2"]), 0.0, values)
+    if form in ("nvm", "openmvg", "aicon", "realitycapture"):
+        values = np.where(np.isin(names, format_named(form).lacks), 0.0, values)
+    return camera.with_parameters(values)
+
+
 def survey(form: str, rng: np.random.Generator) -> Content:
     """A random survey whose camera and image points a format can hold, and of all else a random part."""
-    model = MODEL_OF.get(form, "brown" if form.startswith("bundle") else "full_opencv")
-    network, truth = make_network(rng, images=IMAGES, points=POINTS, model=model, cameras=1)
-    camera = truth.cameras[0]
-    keep = camera.plays(
-        *[role for role in {p.role for p in _parameters(camera.model)} if "FOCAL" in role.name]
-    )
-    centre = {"cx": 999.5, "cy": 749.5}
-    if form in ("sba", "bundle-matlab", "bundle-csharp"):
-        camera = camera.with_parameters(
-            np.array(
-                [
-                    v if k else centre.get(n, 0.0)
-                    for n, v, k in zip(camera.names, camera.parameters, keep, strict=True)
-                ]
-            )
-        )
-    if form == "photomodeler":
-        camera = camera.with_parameters(
-            np.where([n in ("b1", "b2") for n in camera.names], 0.0, camera.parameters)
-        )
-    if form in ("nvm", "openmvg", "aicon", "realitycapture"):
-        left_out = [n in format_named(form).lacks for n in camera.names]
-        camera = camera.with_parameters(np.where(left_out, 0.0, camera.parameters))
+    network, truth = make_network(rng, images=IMAGES, points=POINTS, model=model_of(form), cameras=1)
+    camera = lens_of(form, truth.cameras[0])
     camera = replace(camera, free=camera.free & (rng.random() < 0.5))
     if form == "photomodeler" and chance(rng):  # a calibration project
         camera = replace(camera, free=np.array([name != "b2" for name in camera.names]))
@@ -256,12 +258,6 @@ def test_convert_names_each_kind_that_is_lost(tmp_path: Path, capsys: pytest.Cap
     assert "standard deviations of interior parameters left out" in capsys.readouterr().out
 
 
-def _parameters(model: str):  # type: ignore[no-untyped-def]
-    from sfm.model.distortion.models import MODELS
-
-    return MODELS[model].parameters
-
-
 def in_order_of(before: Content, after: Content) -> Content:
     """The survey as it was read, with its points in the order in which they were written."""
     names, read = before.result.network.points, after.result.network.points
@@ -283,21 +279,63 @@ def in_order_of(before: Content, after: Content) -> Content:
 def test_what_is_lost_is_what_is_named(form: str, tmp_path: Path) -> None:
     for trial in range(12):
         content = survey(form, seed_of(f"content {form} {trial}"))
-        held = format_named(form).held(content)
-        path = tmp_path / f"{trial}"
-        write_content(path, form, content)
-        again = in_order_of(content, read_content(path, form))
-        named = {kind.name for kind, _ in losses(content, held)}
-        for kind in KINDS:
-            if kind.name == "unplaced" and "object points" in named:
-                continue
-            before, after = kind.rows(content), kind.rows(again)
-            if kind.name in named:
-                same = before.shape == after.shape and np.allclose(before, after, equal_nan=True)
-                assert not same or kind.name == "free", kind.name
-            elif kind.name != "free" or len(before):
-                assert before.shape == after.shape, (kind.name, trial)
-                np.testing.assert_allclose(after, before, rtol=1e-9, atol=1e-12, err_msg=kind.name)
+        assert_lost_as_named(content, form, tmp_path / f"{trial}")
+
+
+def rig_survey(form: str, rng: np.random.Generator) -> Content:
+    """A random survey of two to four cameras on a rig, some with held mounts, the last perhaps on no rig."""
+    count = int(rng.integers(2, 5))
+    network, truth = make_rig(rng, cameras=count, moments=4, points=POINTS)
+    shared = make_network(rng, images=2, points=4, model=model_of(form), cameras=1)[1].cameras[0]
+    cameras = tuple(replace(lens_of(form, shared), name=f"camera{k + 1}") for k in range(count))
+    assert truth.mounts is not None and network.moment is not None
+    mounts, alone = truth.mounts, np.full(count, False)
+    if count > 2 and chance(rng):  # the last camera is on no rig
+        alone[-1] = True
+    names = tuple("" if off else "rig" for off in alone)
+    free = mounts.free & ~alone[:, None]
+    if chance(rng):
+        free[1] = False
+    position = np.where(alone[:, None], 0.0, mounts.position)
+    rotation = np.where(alone[:, None, None], np.eye(3), mounts.rotation)
+    moment = np.where(alone[network.camera], 4 + np.arange(len(network.camera)), network.moment)
+    seen, images = network.image_points, tuple(f"image{i + 10}.jpg" for i in range(len(network.images)))
+    seen = replace(
+        seen, covariance=np.tile(np.eye(2), (len(seen), 1, 1)), stated=np.zeros(len(seen), dtype=bool)
+    )
+    if form in STATED:
+        seen = replace(seen, stated=np.ones(len(seen), dtype=bool))
+    network = replace(network, images=images, image_points=seen, moment=moment)
+    truth = replace(
+        truth,
+        cameras=cameras,
+        mounts=replace(mounts, position=position, rotation=rotation, free=free, rig=names),
+    )
+    return Content(Solution("survey", network, truth))
+
+
+@pytest.mark.parametrize("form", SEVERAL)
+def test_rigs_come_back_or_are_named(form: str, tmp_path: Path) -> None:
+    for trial in range(6):
+        content = rig_survey(form, seed_of(f"rig content {form} {trial}"))
+        assert_lost_as_named(content, form, tmp_path / f"{trial}")
+
+
+def assert_lost_as_named(content: Content, form: str, path: Path) -> None:
+    """Write and read a survey, and compare all its numbers but those of the kinds that are named as lost."""
+    write_content(path, form, content)
+    again = in_order_of(content, read_content(path, form))
+    named = {kind.name for kind, _ in losses(content, format_named(form).held(content))}
+    for kind in KINDS:
+        if kind.name == "unplaced" and "object points" in named:
+            continue
+        before, after = kind.rows(content), kind.rows(again)
+        if kind.name in named:
+            same = before.shape == after.shape and np.allclose(before, after, equal_nan=True)
+            assert not same or kind.name == "free", kind.name
+        elif kind.name != "free" or len(before):
+            assert before.shape == after.shape, (kind.name, path.name)
+            np.testing.assert_allclose(after, before, rtol=1e-9, atol=1e-12, err_msg=kind.name)
 
 
 @pytest.mark.parametrize(
