@@ -168,6 +168,24 @@ def update_model(
                 scene.point3D(model.point_ids[j]).xyz = xyz
 
 
+def keep_key_points(model: OpenModel, estimate: Estimate) -> None:
+    """Update a model with a solution of its own key points, which stay as they are.
+
+    Args:
+        model: the model, which is changed in place.
+        estimate: solution for the same photographs and points.
+    """
+    seen = model.network.image_points
+    update_model(
+        model,
+        estimate,
+        xy=seen.xy,
+        measured=np.ones(len(seen), dtype=bool),
+        images=estimate.oriented,
+        points=np.zeros(len(model.network.points), dtype=bool),
+    )
+
+
 def key_points_of(model: OpenModel) -> tuple[int, float]:
     """Return the number of key points with a point, and the RMS per coordinate by COLMAP's projection, px."""
     scene, count, projected, squares = model.scene, 0, 0, 0.0

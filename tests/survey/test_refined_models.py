@@ -115,16 +115,17 @@ def _model(
     rig: bool = False,
     targets: bool = False,
     second: str | None = None,
+    each: bool = False,
 ) -> Any:
     """Write photographs in two folders and a model of them with numbers of its own, and return the scene.
 
     With a second camera model the photographs of the second folder are smaller, and have the names of those
-    in the first.
+    in the first. With a camera for each folder these are alike.
     """
     pictures, truth = _scene(targets)
     rng = np.random.default_rng(9)
     scene = pycolmap.Reconstruction()
-    cameras = (7, 9) if rig or second else (7, 7)
+    cameras = (7, 9) if rig or second or each else (7, 7)
     for number in sorted(set(cameras)):
         lens = pycolmap.Camera(
             model=camera, width=SIZE[0], height=SIZE[1], params=PARAMS[camera], camera_id=number
@@ -331,6 +332,27 @@ def test_a_model_whose_halves_are_worse_is_kept(
     assert f"Model: {tmp_path / 'model'}\n" in printed
     out = tmp_path / "model_refined"
     assert (out / "refinement.html").is_file() and not list(out.glob("*.bin"))
+
+
+def test_cameras_are_joined_although_new_key_points_are_not_better(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """The model then has its own key points, adjusted with one camera; before, it kept its two cameras."""
+    _model(tmp_path, each=True)
+    before = pycolmap.Reconstruction(str(tmp_path / "model"))
+    differences = iter((1e-4, 1.2e-4))
+    monkeypatch.setattr("sfm.products.refining.refinement.halves_apart", lambda *_: next(differences))
+    with pytest.raises(SystemExit, match="1"):
+        refine(tmp_path / "model", tmp_path, one_camera=True)
+    out = tmp_path / "model_refined"
+    assert f"Model: {out}\n" in capsys.readouterr().out
+    after = pycolmap.Reconstruction(str(out))
+    assert len(before.cameras) == 2 and len(after.cameras) == 1
+    assert after.num_reg_images() == before.num_reg_images() == PHOTOGRAPHS
+    assert after.num_points3D() == before.num_points3D()
+    for i in before.images:
+        np.testing.assert_array_equal(_key_points(after, i), _key_points(before, i))
+    assert _rms(after) < _rms(before)
 
 
 def test_key_points_that_are_neighbours_err_together(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -76,13 +76,15 @@ def refine(
     key points; its control and scale bars define the frame and scale of the model.
 
     If halves of the points do not agree better than before, the model as it came is kept: the folder has the
-    page alone, and the exit code is 1.
+    page alone, and the exit code is 1. With --one-camera it has the model with its own key points and the
+    joined cameras.
     """
     with loading():
         from adapters.colmap.camera_models import write_scene
         from adapters.colmap.refined_model import (
             interior_rows,
             join_cameras_of,
+            keep_key_points,
             key_points_of,
             open_model,
             place_model,
@@ -128,26 +130,30 @@ def refine(
         )
     a = refinement.adjustment
     interior = interior_rows(opened, refinement.start, refinement.estimate, a.covariance.interior)
-    update_model(
-        opened,
-        refinement.estimate,
-        xy=refinement.xy,
-        measured=refinement.accepted,
-        images=refinement.images,
-        points=refinement.points_anew,
-    )
+    written = refinement.better or one_camera  # cameras that were joined are in no model so far
+    if refinement.better:
+        update_model(
+            opened,
+            refinement.estimate,
+            xy=refinement.xy,
+            measured=refinement.accepted,
+            images=refinement.images,
+            points=refinement.points_anew,
+        )
+    elif refinement.as_it_came is not None:
+        keep_key_points(opened, refinement.as_it_came)
     numbers = Numbers(opened.image_ids, opened.point_ids, interior, *key_points_of(opened))
     print(refinement_text(refinement), end="")
     page = page_of(refinement, numbers=numbers, title=model.resolve().name)
     with whole_folder(out) as folder:
-        if refinement.better:
+        if written:
             write_scene(folder, opened.scene)
         for name, text in texts_of(page).items():
             (folder / name).write_text(text, encoding="utf-8")
     print(describe_key_points(refinement, numbers))
     if set(opened.models) <= PINHOLES and not {"cx", "cy"} <= set(names_in(fix)):
         print("cameras       are pinholes, of which some programs read f alone: for these add --fix cx,cy")
-    print(f"Model: {out if refinement.better else model}")
+    print(f"Model: {out if written else model}")
     print_page("Report", out / page.path, pdf=pdf)
     if not (refinement.dependable and refinement.better):
         raise SystemExit(FAILED)

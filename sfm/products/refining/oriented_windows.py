@@ -185,11 +185,8 @@ def whole_model(
     Returns:
         The estimate, and the new image points whose rays meet in points that were not adjusted.
     """
-    position, rotation, xyz = estimate.position.copy(), estimate.rotation.copy(), estimate.points.copy()
-    position[images], rotation[images] = part.position, part.rotation
-    xyz[points] = part.points[: int(points.sum())]
-    oriented = Estimate(part.cameras, position, rotation, xyz, part.mounts)
-    seen = network.image_points
+    oriented = with_part(estimate, part, images, points)
+    seen, xyz = network.image_points, oriented.points.copy()
     other = ~points[seen.point] & images[seen.image]
     rows = np.flatnonzero(other & np.isfinite(windows.xy).all(axis=1))
     anew = ImagePoints(seen.image[rows], seen.point[rows], windows.xy[rows], windows.covariance[rows])
@@ -197,13 +194,37 @@ def whole_model(
     met = intersect_image_points(anew, network.camera, oriented, n_points=n, tolerance_px=tolerance_px)
     enough = met.rays >= MIN_RAYS
     xyz[enough] = met.points[enough]
-    original = seen.select(other & ~enough[seen.point])
-    intersected = intersect_image_points(
-        original, network.camera, oriented, n_points=n, tolerance_px=np.inf
+    oriented = replace(oriented, points=xyz)
+    whole = with_intersected(network, oriented, other & ~enough[seen.point])
+    return whole, rows[met.used & enough[anew.point]]
+
+
+def with_part(estimate: Estimate, part: Estimate, images: BoolArray, points: BoolArray) -> Estimate:
+    """Return the solution of a model with an adjusted part.
+
+    Args:
+        estimate: the original solution.
+        part: the adjusted part; targets follow the points of the model.
+        images: photographs of the part, (m,).
+        points: points of the part, (n,).
+    """
+    position, rotation, xyz = estimate.position.copy(), estimate.rotation.copy(), estimate.points.copy()
+    position[images], rotation[images] = part.position, part.rotation
+    xyz[points] = part.points[: int(points.sum())]
+    return Estimate(part.cameras, position, rotation, xyz, part.mounts)
+
+
+def with_intersected(network: Network, estimate: Estimate, rows: BoolArray) -> Estimate:
+    """Return the solution of a model with the points of some of its image points, (k,), intersected."""
+    met = intersect_image_points(
+        network.image_points.select(rows),
+        network.camera,
+        estimate,
+        n_points=len(network.points),
+        tolerance_px=np.inf,
     ).points
-    again = np.isfinite(intersected).all(axis=1)
-    xyz[again] = intersected[again]
-    return replace(oriented, points=xyz), rows[met.used & enough[anew.point]]
+    again = np.asarray(np.isfinite(met).all(axis=1))
+    return replace(estimate, points=np.where(again[:, None], met, estimate.points))
 
 
 def part_of(

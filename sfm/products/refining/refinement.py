@@ -46,6 +46,8 @@ from sfm.products.refining.oriented_windows import (
     reasons_of,
     refuse_undetermined,
     whole_model,
+    with_intersected,
+    with_part,
 )
 from sfm.products.refining.windows import (
     MAX_REDUCED_RATIO,
@@ -108,6 +110,7 @@ class Refinement:
     """RMS difference of projection centres of two halves of the points, before and after, relative to the
     distance; see `halves_apart`"""
     like: tuple[LikeCameras, ...] = ()  # cameras that could be one
+    as_it_came: Estimate | None = None  # the whole model, adjusted with its original key points
 
     @property
     def better(self) -> bool:
@@ -253,8 +256,13 @@ def refine_model(
     before = float(np.sqrt((residuals[usable] ** 2).mean()))
     spread = MAD_TO_SIGMA * float(np.median(np.abs(residuals[usable])))
     progress.stage("adjustment as it came")
-    first, start, _, _ = part_of(network, estimate, usable, np.full(len(network.points), MIN_RAYS))
+    first, start, of_first, held = part_of(network, estimate, usable, np.full(len(network.points), MIN_RAYS))
     readjusted = with_neighbours(adjust(first, start, datum=Datum("free"), reject="none"))
+    as_it_came = with_intersected(
+        network,
+        with_part(estimate, readjusted.estimate, of_first, held),
+        usable & ~held[seen.point] & of_first[seen.image],
+    )
     masked = np.zeros(len(seen), dtype=bool)
     if settings.masks_dir is not None:
         masked = outside_masks(network, estimate, settings.masks_dir, images_dir)
@@ -346,6 +354,7 @@ def refine_model(
             halves_apart(final.network, final.estimate, ~final.rejected),
         ),
         like=like_cameras(final, settings.false_alarm),
+        as_it_came=as_it_came,
     )
 
 
