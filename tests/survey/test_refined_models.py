@@ -28,7 +28,7 @@ from sfm.model.estimate import Estimate
 from sfm.model.network import ImagePoints, Network
 from sfm.model.similarity import Similarity
 from sfm.products.refining import windows as model_photographs
-from sfm.products.refining.refinement import UNSUPPORTED, refine_model
+from sfm.products.refining.refinement import UNSUPPORTED, refine_model, refinement_text
 from sfm.products.refining.windows import KeyPoints, Limits, Size, Windows, match_reduced
 from sfm.targets.codes.rings import ring_family
 from tests.tables import rows_of
@@ -321,6 +321,7 @@ def test_a_model_whose_halves_are_worse_is_kept(
     for halves in ((2e-4, 1e-4), (float("nan"), 1e-4), (1e-4, float("nan"))):
         better = replace(refined, halves=halves)
         assert better.better and not better.remarks
+        assert ("halves        not compared" in refinement_text(better)) == bool(np.isnan(sum(halves)))
     worse = replace(refined, halves=(1e-4, 1.1e-4))
     assert [said.kind for said in worse.remarks] == ["refinement_not_better"]
     differences = iter((1e-4, 1.2e-4))

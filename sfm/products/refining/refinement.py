@@ -362,7 +362,7 @@ def refinement_text(result: Refinement) -> str:
     """Return the lines that the command line prints."""
     why = describe_reasons(result.reasons)
     before, after = result.halves
-    halves = ""  # where they cannot be compared
+    halves = "halves        not compared: a half of the points leaves fewer than four photographs oriented\n"
     if np.isfinite(before + after):
         halves = (
             "halves        of the points: projection centres differ by "
