@@ -517,11 +517,24 @@ def test_what_is_written_is_what_was_adjusted(tmp_path: Path) -> None:
     sharp = cv2.imread(str(path), cv2.IMREAD_GRAYSCALE).astype(float)
     seen = cv2.GaussianBlur(sharp, (0, 0), 2.0) + np.random.default_rng(2).normal(0, 2, sharp.shape)
     cv2.imwrite(str(path), seen.clip(0, 255).astype(np.uint8))
-    found = refine_model(*read_model(tmp_path / "model"), tmp_path)
+    opened = open_model(tmp_path / "model")
+    found = refine_model(opened.network, opened.estimate, tmp_path)
     adjusted = found.adjustment.network.image_points
     assert len(found.rows) == len(adjusted) > 50
     np.testing.assert_array_equal(found.xy[found.rows], adjusted.xy)
     assert np.isfinite(found.xy[found.accepted]).all()
+    refine(tmp_path / "model", tmp_path)
+    network, written = read_model(tmp_path / "model_refined")
+    seen, ours = network.image_points, found.model.image_points
+    there = {(network.images[i], j): xy for i, j, xy in zip(seen.image, seen.point, seen.xy, strict=True)}
+    numbers = {name: j for j, name in enumerate(network.points)}
+    rows = np.flatnonzero(found.accepted)
+    of_file = [
+        there[found.model.images[ours.image[row]], numbers[found.model.points[ours.point[row]]]]
+        for row in rows
+    ]
+    np.testing.assert_allclose(of_file, found.xy[rows], rtol=0, atol=1e-12)
+    np.testing.assert_allclose(written.points, found.estimate.points[: len(written.points)], atol=1e-12)
 
 
 def test_matches_of_a_point_with_too_few_of_them_contradict_nothing(tmp_path: Path) -> None:
