@@ -66,6 +66,7 @@ from adapters.reading.text_lines import Lines
 from adapters.reading.trees import head_of
 from sfm.files.csv_tables import write_ply
 from sfm.files.open_folders import refuse_links, refuse_links_out
+from sfm.files.plain_text import as_plain
 from sfm.files.whole_files import whole_file, whole_folder
 from sfm.model.camera import Camera
 from sfm.model.display import counted
@@ -75,6 +76,7 @@ from sfm.model.estimate import Estimate
 from sfm.model.network import Network
 from sfm.model.solution import Solution
 
+SPARSE = "sparse"  # folder of the models of a project
 Reader = Callable[[Path], tuple[Network, Estimate]]
 Writer = Callable[[Path, Network, Estimate], None]
 
@@ -595,11 +597,25 @@ def read_content(path: Path, name: str | None = None, *, control: Path | None = 
             uncoded = tuple(f"u{name}" if name.isdecimal() else name for name in network.points)
             network = replace(network, points=uncoded)
         content = Content(
-            Solution(path.name, network, estimate, points_named=points_named, images_named=form.names[1])
+            Solution(
+                model_name(path), network, estimate, points_named=points_named, images_named=form.names[1]
+            )
         )
     seen = content.result.network.image_points
     stated = bool(len(seen) and np.isfinite(seen.stated_sigma).all())
     return replace(content, stated_weights=stated and form.adjusts)
+
+
+def model_name(path: Path) -> str:
+    """Return the name of a model: that of its file or folder, after that of its project where it is a number.
+
+    COLMAP and others that make several models of a project write them into sparse/0, sparse/1 and so on.
+    """
+    parts = path.resolve().parts[1:]
+    k = len(parts) - 1
+    while k > 0 and (parts[k].isdecimal() or parts[k] == SPARSE):
+        k -= 1
+    return " ".join(as_plain(part) for part in parts[k:] if part != SPARSE) or path.name
 
 
 def read_comparable(path: Path, name: str | None = None) -> Solution:

@@ -26,6 +26,7 @@ from adapters.formats.registry import (
     describe_stored,
     format_named,
     format_of,
+    model_name,
     read_any,
     read_comparable,
     write_any,
@@ -657,3 +658,14 @@ def test_matlab_files_have_the_names_of_the_thesis_or_are_named(tmp_path: Path) 
         for name in ("cams.txt", "pts.txt", "sigmas.txt", "interior.txt"):
             assert name in str(told.value)
         (tmp_path / "m" / "utara1_6.txt").unlink(missing_ok=True)
+
+
+@pytest.mark.parametrize(
+    ("folder", "name"),
+    [("bridge/sparse/0", "bridge 0"), ("bridge/0", "bridge 0"), ("bridge/model", "model"), ("0", None)],
+)
+def test_a_model_of_a_number_has_the_name_of_its_project(
+    folder: str, name: str | None, tmp_path: Path
+) -> None:
+    """COLMAP's first model was titled "0", and two of them could not be told apart in a comparison."""
+    assert model_name(tmp_path / folder) == (name or f"{tmp_path.name} 0")
