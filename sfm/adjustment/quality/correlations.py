@@ -35,7 +35,6 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-from scipy.optimize import nnls
 from scipy.sparse import csr_matrix
 from scipy.spatial import ConvexHull, QhullError
 
@@ -187,6 +186,8 @@ def _correlation_of(
     adjustment: Adjustment, m: Marginal, linear: Linearised, used: BoolArray
 ) -> ErrorCorrelation | None:
     """Return the correlation that fits the residuals best, see `estimate_error_correlation`."""
+    from scipy.optimize import nnls  # importing takes half a second, and many commands never need it
+
     if not used.any():
         return None
     o = m.layout.observations

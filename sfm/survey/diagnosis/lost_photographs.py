@@ -31,7 +31,6 @@ from dataclasses import dataclass, replace
 
 import cv2
 import numpy as np
-from scipy.optimize import minimize
 from scipy.sparse import csr_matrix
 from scipy.sparse.csgraph import connected_components, minimum_spanning_tree
 
@@ -366,6 +365,8 @@ def _least_parallax(
     network: Network, cameras: tuple[Camera, ...], pairs: list[tuple[IntArray, IntArray]]
 ) -> FloatArray | None:
     """Return the parallax of each pair, px, minimised over c and distortion; None at the search limit."""
+    from scipy.optimize import minimize  # importing takes half a second, and most surveys never need it
+
     seen = network.image_points
     given = image_tangents(seen, network.camera, cameras)
     c_px = np.array([camera.c_px for camera in cameras])[network.camera[seen.image]]
