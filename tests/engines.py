@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import os
 import signal
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from contextlib import nullcontext
 from pathlib import Path
 from typing import Any, NoReturn
@@ -13,6 +13,7 @@ from sfm.cli.commands.batch import InProcess
 from sfm.judgement.survey_result import SurveyResult
 from sfm.products.batch.job import Comparers, SurveyRow
 from sfm.runtime.executor import Send
+from sfm.runtime.forecast import Work as Extent
 from sfm.survey.assembly import OtherPrograms
 from sfm.survey.inputs.survey import Survey
 
@@ -39,8 +40,8 @@ class Notes:
         self.finished_rows: list[tuple[SurveyRow, bool]] = []
         self.remarks: list[str] = []
 
-    def planned(self, names: Sequence[str]) -> None:
-        self.names = names
+    def planned(self, works: Mapping[str, Extent | None], workers: int) -> None:
+        self.names = tuple(works)
 
     def received(self, name: str, message: dict[str, Any]) -> None:
         self.messages.append((name, message))

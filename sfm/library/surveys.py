@@ -19,10 +19,13 @@ from sfm.model.errors import BackendError, SurveyFileError
 from sfm.model.remarks.remark import Remark, remark
 from sfm.model.solution import Solution, solution_of
 from sfm.pipeline import run_survey as run_stages
+from sfm.runtime.forecast import RunHistory, expected_seconds
 from sfm.runtime.progress import SILENT, Progress
 from sfm.runtime.threads import cores, one_blas_thread
 from sfm.survey.assembly import OtherPrograms
+from sfm.survey.inputs.measurements import NO_PHOTOGRAPHS, find_photographs, work_of
 from sfm.survey.inputs.named_folders import named_folder
+from sfm.survey.inputs.sources import reads_photographs
 from sfm.survey.inputs.survey import Survey, read_survey
 from sfm.survey.measuring.measured_store import MeasuredStore
 
@@ -66,23 +69,34 @@ def run_survey(
     others = programs_of(
         compare_with or survey.compare.backend, "none" if compare_with == "none" else survey.compare.baseline
     )
+    images_dir = named_folder(survey, None if images is None else Path(images))
     with ExitStack() as stack:
         stack.enter_context(one_blas_thread())
         watching: Progress = SILENT
         if progress is True:
             from sfm.runtime.progress_bar import drawn_progress
 
-            watching = stack.enter_context(drawn_progress())
+            watching = drawn = stack.enter_context(drawn_progress())
+            drawn.countdown.expected = _expected_of_stages(survey, images_dir)
         elif progress is not False:
             watching = progress
         return run_stages(
             survey,
-            images_dir=named_folder(survey, None if images is None else Path(images)),
+            images_dir=images_dir,
             jobs=jobs or cores(),
             others=others,
             store=None if store is None else MeasuredStore(Path(store)),
             progress=watching,
         )
+
+
+def _expected_of_stages(survey: Survey, images_dir: Path | None) -> dict[str, float]:
+    """Return the expected time of each stage of a survey without its report, s."""
+    reads = reads_photographs(survey)
+    files = find_photographs(survey, images_dir=images_dir) if reads else NO_PHOTOGRAPHS
+    expected = expected_seconds(work_of(survey, files), RunHistory.of_user().read())
+    expected.pop("report", None)
+    return expected
 
 
 @checked_arguments()

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import json
 import math
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from contextlib import suppress
 from dataclasses import asdict, dataclass, field
 from pathlib import Path
@@ -36,6 +36,7 @@ GROWTH = {
     "comparison": (1.2, 0.0),
 }
 OTHER_GROWTH = (1.0, 0.0)
+MEASURED = ("photographs", "targets", "tie points")  # stages that measure several photographs at a time
 
 
 @dataclass(frozen=True)
@@ -45,13 +46,22 @@ class Work:
     sources: tuple[str, ...]  # of image points
     photographs: int
     megapixels: float = 0.0  # of a photograph; 0 where none is read
+    image_points: int = 0  # that are given; 0 where all are measured
 
     def distance(self, other: Work) -> float:
         """Return how unlike two surveys are; infinite for other sources."""
-        if set(self.sources) != set(other.sources) or (self.megapixels > 0) != (other.megapixels > 0):
+        if set(self.sources) != set(other.sources):
             return math.inf
-        of_size = abs(math.log(self.megapixels / other.megapixels)) if self.megapixels else 0.0
-        return of_size + abs(math.log(max(1, self.photographs) / max(1, other.photographs)))
+        numbers = (
+            (self.photographs, other.photographs),
+            (self.megapixels, other.megapixels),
+            (self.image_points, other.image_points),
+        )
+        if any((number > 0) != (of_other > 0) for number, of_other in numbers[1:]):
+            return math.inf
+        return sum(
+            abs(math.log(number / of_other)) for number, of_other in numbers if number > 0 and of_other > 0
+        )
 
 
 @dataclass(frozen=True)
@@ -64,6 +74,8 @@ class Run:
     def scaled_to(self, work: Work) -> dict[str, float]:
         """Return the time that each stage would take for another survey of these sources, s."""
         of_number = max(1, work.photographs) / max(1, self.work.photographs)
+        if self.work.image_points:
+            of_number = work.image_points / self.work.image_points
         of_size = work.megapixels / self.work.megapixels if self.work.megapixels else 1.0
         scaled = {}
         for stage, seconds in self.seconds.items():
@@ -72,29 +84,28 @@ class Run:
         return scaled
 
 
-def _typical(
-    sources: tuple[str, ...], photographs: int, megapixels: float, stages: str, *seconds: float
-) -> Run:
-    work = Work(sources, photographs, megapixels)
+def _typical(work: Work, stages: str, *seconds: float) -> Run:
     return Run(work, dict(zip(stages.split(", "), seconds, strict=True)))
 
 
 _TARGETS = "targets, orientation, matching, adjustment, comparison, report"
 _TEXTURE = "tie points, orientation, matching, adjustment, comparison, report"
-# Two cores of 2.5 GHz, 2026-11: camcal, the demo, fountain-P11, a sheet of targets on texture, and the image
-# points of stereo10.
+# Two cores of 2.5 GHz, 2026-11: camcal, stereo-chessboard, the demo, fountain-P11, a sheet of targets on
+# texture, and the image points of stereo10. In the first two, whose photographs are real, causes of errors
+# are found and tried.
 TYPICAL = (
-    _typical(("targets",), 21, 3.87, _TARGETS, 3.5, 0.2, 0.4, 7.6, 0.7, 1.6),
-    _typical(("targets",), 12, 1.92, _TARGETS, 4.3, 0.4, 0.3, 0.3, 0.4, 1.2),
-    _typical(("texture",), 11, 6.29, _TEXTURE, 7.0, 2.0, 12.0, 8.0, 2.0, 6.0),
+    _typical(Work(("targets",), 21, 3.87), _TARGETS, 3.5, 0.2, 0.4, 7.6, 0.7, 1.6),
+    _typical(Work(("targets",), 28, 0.31), _TARGETS, 1.2, 0.1, 0.7, 6.6, 0.3, 1.2),
+    _typical(Work(("targets",), 12, 1.92), _TARGETS, 4.3, 0.4, 0.3, 0.3, 0.4, 1.2),
+    _typical(Work(("texture",), 11, 6.29), _TEXTURE, 7.0, 2.0, 12.0, 8.0, 2.0, 6.0),
     _typical(
-        ("targets", "texture"),
-        30,
-        0.31,
+        Work(("targets", "texture"), 30, 0.31),
         "photographs, targets, tie points, orientation, matching, adjustment, comparison, report",
         *(6.1, 0.1, 4.6, 1.9, 9.2, 3.7, 1.0, 4.0),
     ),
-    _typical(("given",), 10, 0.0, "orientation, adjustment, comparison, report", 0.4, 0.1, 0.1, 0.6),
+    _typical(
+        Work(("given",), 10, 0.0, 20), "orientation, adjustment, comparison, report", 0.4, 0.1, 0.1, 0.6
+    ),
 )
 
 
@@ -138,9 +149,11 @@ class RunHistory:
             for line in self.path.read_text("utf-8").splitlines()[-KEPT_RUNS:]:
                 with suppress(ValueError, TypeError, KeyError, AttributeError, OverflowError, RecursionError):
                     row = json.loads(line)
-                    work = Work(tuple(map(str, row["sources"])), int(row["photographs"]), row["megapixels"])
+                    given = int(row["image_points"])
+                    pixels = float(row["megapixels"])
+                    work = Work(tuple(map(str, row["sources"])), int(row["photographs"]), pixels, given)
                     seconds = {str(stage): float(took) for stage, took in row["seconds"].items()}
-                    numbers = (work.photographs, work.megapixels, *seconds.values())
+                    numbers = (work.photographs, pixels, given / LARGEST, *seconds.values())
                     in_range = all(0 <= number <= LARGEST for number in numbers)
                     if in_range and work.photographs and not 0 < work.megapixels < 1 / LARGEST:
                         runs.append(Run(work, seconds))
@@ -158,6 +171,21 @@ class RunHistory:
                 part.write_text("".join(f"{line}\n" for line in lines), "utf-8")
 
 
+def slowness(compared: Sequence[tuple[float, float]]) -> float:
+    """Return how much longer stages take than expected: the geometric mean, weighted by the expected times.
+
+    A stage that found much more to do than usual, such as causes to try, says little of the others.
+
+    Args:
+        compared: time that each stage took, and the expected one, s.
+    """
+    rows = [(took, expected) for took, expected in compared if took > 0 and expected > 0]
+    of_all = sum(expected for _, expected in rows)
+    if not of_all:
+        return 1.0
+    return math.exp(sum(expected * math.log(took / expected) for took, expected in rows) / of_all)
+
+
 @dataclass
 class Countdown:
     """What is left of a survey, by the expected times of its stages and by those that it has taken."""
@@ -169,7 +197,30 @@ class Countdown:
         """Note the time that a stage took, s; that of a stage that comes again is added."""
         self.taken[stage] = self.taken.get(stage, 0.0) + seconds
 
-    def left(self, stage: str, elapsed: float, done: int = 0, parts: int = 0) -> float | None:
+    def counted(self, stage: str, elapsed: float, done: int, parts: int) -> float | None:
+        """Return the time of the present stage by its finished parts, s; None without any."""
+        if not done:
+            return None
+        weight = 1 / (1 + (PARTS_SIGMA / (EXPECTED_SIGMA * done)) ** 2)
+        return weight * elapsed * parts / done + (1 - weight) * self.expected.get(stage, 0.0)
+
+    def compared(self, stage: str = "", counted: float | None = None) -> list[tuple[float, float]]:
+        """Return the times of stages and the expected ones, s, without those read from an earlier run.
+
+        Args:
+            stage: the present stage.
+            counted: its time by its parts, s.
+        """
+        known = self.taken | ({stage: counted} if counted is not None else {})
+        return [
+            (took, self.expected[name])
+            for name, took in known.items()
+            if took > STORED_SHARE * self.expected.get(name, math.inf)
+        ]
+
+    def left(
+        self, stage: str, elapsed: float, done: int = 0, parts: int = 0, slower: float | None = None
+    ) -> float | None:
         """Return the time left of all stages, s; None where nothing is expected of them.
 
         Args:
@@ -177,21 +228,118 @@ class Countdown:
             elapsed: time since it began, s.
             done: number of its parts that are finished; 0 if it counts only a part of its work.
             parts: number of all its parts.
+            slower: how much longer stages take than expected; None for those of this survey.
         """
         if not self.expected:
             return None
-        counted = None
-        if done:
-            weight = 1 / (1 + (PARTS_SIGMA / (EXPECTED_SIGMA * done)) ** 2)
-            counted = weight * elapsed * parts / done + (1 - weight) * self.expected.get(stage, 0.0)
-        known = self.taken | ({stage: counted} if counted is not None else {})
-        compared = [
-            (took, self.expected[name])
-            for name, took in known.items()
-            if took > STORED_SHARE * self.expected.get(name, math.inf)
-        ]
-        of_compared = sum(of for _, of in compared)  # 0 where a coarse clock measured nothing
-        slower = sum(took for took, _ in compared) / of_compared if of_compared > 0 else 1.0
+        counted = self.counted(stage, elapsed, done, parts)
+        if slower is None:
+            slower = slowness(self.compared(stage, counted))
         of_stage = counted if counted is not None else slower * self.expected.get(stage, 0.0)
         later = sum(s for name, s in self.expected.items() if name != stage and name not in self.taken)
         return max(0.0, of_stage - elapsed) + slower * later
+
+
+@dataclass
+class _Surveyed:
+    """A survey of a batch in progress."""
+
+    countdown: Countdown
+    stage: str = ""
+    elapsed: float = 0.0  # time that the parts of the stage took together, s
+    begun: float | None = None  # when the stage began, s of a clock; None while its parts are counted
+    done: int = 0  # parts
+    parts: int = 0
+    stored: bool = False  # whether a part was measured in an earlier run
+
+
+class BatchCountdown:
+    """What is left of a batch: countdowns of its surveys, in computing time, over the number of workers.
+
+    The surveys that the batch has finished count among the earlier runs for those to come.
+    """
+
+    def __init__(
+        self, works: Mapping[str, Work | None], runs: Sequence[Run], *, workers: int, threads: int
+    ) -> None:
+        """Begin.
+
+        Args:
+            works: what the time of each survey depends on; None where it is not known.
+            runs: earlier runs of the user, the last one last.
+            workers: number of calls of the batch that run at a time.
+            threads: that measured the photographs of an earlier run; a survey of a batch has one.
+        """
+        self._works = dict(works)  # of surveys that are not finished
+        self._runs = list(runs)
+        self._workers, self._threads = workers, threads
+        self._begun: dict[str, _Surveyed] = {}
+
+    def _expected(self, name: str) -> dict[str, float]:
+        work = self._works.get(name)
+        if work is None:
+            return {}
+        seconds = expected_seconds(work, self._runs)
+        return {stage: s * (self._threads if stage in MEASURED else 1) for stage, s in seconds.items()}
+
+    def _surveyed(self, name: str) -> _Surveyed:
+        if name not in self._begun:
+            self._begun[name] = _Surveyed(Countdown(self._expected(name)))
+        return self._begun[name]
+
+    def measured(self, name: str, seconds: float, parts: int, *, stored: bool) -> None:
+        """Note a photograph of a survey, the time that it took, s, and the number of all its photographs."""
+        survey = self._surveyed(name)
+        survey.stage = next((stage for stage in survey.countdown.expected if stage in MEASURED), MEASURED[0])
+        survey.elapsed, survey.done, survey.parts = survey.elapsed + seconds, survey.done + 1, parts
+        survey.stored |= stored
+
+    def begin(self, name: str, stage: str, now: float, last: float | None = None) -> None:
+        """Note that a stage of a survey begins, and the time that the one before took, s, if known."""
+        survey = self._surveyed(name)
+        if survey.begun is None:
+            if survey.done:
+                survey.countdown.finish(survey.stage, survey.elapsed)
+        elif survey.stage != stage:
+            survey.countdown.finish(survey.stage, now - survey.begun if last is None else last)
+        survey.stage, survey.begun, survey.done, survey.elapsed = stage, now, 0, 0.0
+
+    def finish(self, name: str, seconds: float, *, dependable: bool) -> None:
+        """Note the end of a survey, and its computing time, s, if it has a result."""
+        work, survey = self._works.pop(name, None), self._begun.pop(name, None)
+        if survey is None or work is None or not dependable:
+            return
+        taken = survey.countdown.taken
+        survey.countdown.finish(survey.stage, max(0.0, seconds - sum(taken.values())))
+        if not survey.stored:
+            as_run = {stage: s / (self._threads if stage in MEASURED else 1) for stage, s in taken.items()}
+            self._runs.append(Run(work, as_run))
+            for other, begun in self._begun.items():
+                begun.countdown.expected = self._expected(other)
+
+    def left(self, now: float) -> float | None:
+        """Return the time to the end of the batch, s; None where nothing is expected of its surveys.
+
+        Args:
+            now: time of the clock of `begin`, s.
+        """
+        present, compared = [], list[tuple[float, float]]()
+        for name in self._works:
+            survey = self._begun.get(name)
+            if survey is None:
+                survey = _Surveyed(Countdown(self._expected(name)))
+            elapsed = survey.elapsed if survey.begun is None else now - survey.begun
+            counted = survey.countdown.counted(survey.stage, elapsed, survey.done, survey.parts)
+            compared += survey.countdown.compared(survey.stage, counted)
+            present.append((survey, elapsed))
+        slower = slowness(compared)
+        times = [
+            survey.countdown.left(survey.stage, elapsed, survey.done, survey.parts, slower)
+            for survey, elapsed in present
+        ]
+        known = [seconds for seconds in times if seconds is not None]
+        if not known:
+            return None
+        unknown = len(times) - len(known)  # as long as the others
+        of_all = sum(known) * (1 + unknown / len(known))
+        return max(of_all / self._workers, max(known))

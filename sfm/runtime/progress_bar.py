@@ -106,19 +106,19 @@ class _Times(ProgressColumn):
 
     def render(self, task: Task) -> Text:
         """Return the text of the column."""
-        text = Text(_clock(task.elapsed or 0.0), "progress.elapsed")
+        text = Text(clock_time(task.elapsed or 0.0), "progress.elapsed")
         left = task.time_remaining
         if left and not task.finished:
-            text.append(f", about {_clock(left)} left", "progress.remaining")
+            text.append(f", about {clock_time(left)} left", "progress.remaining")
         if task.stop_time is None:
             parts = task.fields["parts"]
             done = int(task.completed) if parts and task.total == parts else 0
             of_all = self._countdown.left(task.description, task.elapsed or 0.0, done, parts or 0)
             if of_all is not None:
-                text.append(f", {_clock(of_all)} to the end", "progress.remaining")
+                text.append(f", {clock_time(of_all)} to the end", "progress.remaining")
         return text
 
 
-def _clock(seconds: float) -> str:
+def clock_time(seconds: float) -> str:
     """Return a time as hours, minutes and seconds."""
     return str(timedelta(seconds=round(min(max(seconds, 0.0), LONGEST_S))))

@@ -10,7 +10,17 @@ from pathlib import Path
 import pytest
 from rich.console import Console
 
-from sfm.runtime.forecast import KEPT_RUNS, TYPICAL, Countdown, Run, RunHistory, Work, expected_seconds
+from sfm.runtime.forecast import (
+    KEPT_RUNS,
+    TYPICAL,
+    BatchCountdown,
+    Countdown,
+    Run,
+    RunHistory,
+    Work,
+    expected_seconds,
+    slowness,
+)
 from sfm.runtime.progress_bar import drawn_progress
 from sfm.survey.inputs.measurements import NO_PHOTOGRAPHS, find_photographs, work_of
 from sfm.survey.inputs.survey import read_survey
@@ -104,6 +114,77 @@ def test_a_folder_that_others_may_write_keeps_nothing(
     before = kept.path.read_bytes()
     RunHistory.of_user().add(LARGE)
     assert RunHistory.of_user().read() == [] and kept.path.read_bytes() == before
+
+
+def test_surveys_of_given_image_points_are_scaled_by_these() -> None:
+    few = Run(Work(("given",), 10, 0.0, 100), {"adjustment": 1.0, "orientation": 2.0})
+    many = Run(Work(("given",), 10, 0.0, 100_000), {"adjustment": 1000.0, "orientation": 20.0})
+    expected = expected_seconds(Work(("given",), 40, 0.0, 50_000), [many, few])
+    assert expected == pytest.approx({"adjustment": 1000.0 * 0.5**1.2, "orientation": 10.0})
+
+
+def test_a_stage_that_finds_more_to_do_says_nothing_of_the_others() -> None:
+    assert slowness([(20.0, 10.0), (1.0, 0.5)]) == pytest.approx(2.0)
+    assert 2.0 < slowness([(20.0, 10.0), (1.0, 0.5), (60.0, 1.0)]) < 3.0
+    assert slowness([]) == slowness([(1.0, 0.0)]) == slowness([(0.0, 1.0)]) == 1.0
+    countdown = Countdown({"targets": 10.0, "adjustment": 1.0, "report": 3.0})
+    countdown.finish("targets", 10.0)
+    countdown.finish("adjustment", 40.0)  # causes were tried
+    left = countdown.left("report", 1.0)
+    assert left is not None and 2.0 < left < 4.0
+
+
+def batch_of(count: int, *, workers: int = 1, runs: tuple[Run, ...] = (SMALL,)) -> BatchCountdown:
+    """Return the countdown of a batch of surveys as `SMALL`, whose photographs one thread measured."""
+    works = {f"s{k}": SMALL.work for k in range(count)}
+    return BatchCountdown(works, runs, workers=workers, threads=1)
+
+
+def run_one(batch: BatchCountdown, name: str, now: float, slower: float) -> float:
+    """Run a survey as `SMALL` in a batch, and return the time when it ends."""
+    for _ in range(10):
+        batch.measured(name, slower * 0.5, 10, stored=False)
+    before = 0.0
+    for stage, seconds in list(SMALL.seconds.items())[1:]:
+        batch.begin(name, stage, now, before)
+        before = slower * seconds
+    batch.finish(name, slower * 8.0, dependable=True)
+    return now + slower * 8.0
+
+
+def test_the_time_to_the_end_of_a_batch_is_that_of_its_surveys() -> None:
+    whole = sum(SMALL.seconds.values())
+    assert batch_of(5).left(0.0) == pytest.approx(5 * whole)
+    assert batch_of(5, workers=4).left(0.0) == pytest.approx(5 * whole / 4)
+    assert batch_of(2, workers=4).left(0.0) == pytest.approx(whole)  # one worker runs a survey to its end
+    assert BatchCountdown({"a": None}, [], workers=1, threads=1).left(0.0) is None
+    half = BatchCountdown({"a": SMALL.work, "b": None}, [SMALL], workers=1, threads=1)
+    assert half.left(0.0) == pytest.approx(2 * whole)  # the one without a forecast is as long as the other
+    threads = BatchCountdown({"a": SMALL.work}, [SMALL], workers=1, threads=2)
+    assert threads.left(0.0) == pytest.approx(whole + SMALL.seconds["targets"])
+
+
+@pytest.mark.parametrize("slower", [0.4, 1.0, 3.0])
+def test_finished_surveys_of_a_batch_forecast_the_others(slower: float) -> None:
+    batch, whole = batch_of(4), slower * sum(SMALL.seconds.values())
+    now = run_one(batch, "s0", 0.0, slower)
+    assert batch.left(now) == pytest.approx(3 * whole)
+    for _ in range(5):
+        batch.measured("s1", slower * 0.5, 10, stored=False)
+    assert batch.left(now) == pytest.approx(3 * whole - slower * 2.5, rel=0.02)
+    batch.finish("s1", slower, dependable=False)
+    assert batch.left(now) == pytest.approx(2 * whole)
+
+
+def test_surveys_kept_or_read_from_an_earlier_run_forecast_no_others() -> None:
+    batch, whole = batch_of(3), sum(SMALL.seconds.values())
+    batch.finish("s0", 0.0, dependable=False)  # kept
+    assert batch.left(0.0) == pytest.approx(2 * whole)
+    for _ in range(10):
+        batch.measured("s1", 0.001, 10, stored=True)
+    batch.begin("s1", "orientation", 0.0, 0.0)
+    batch.finish("s1", 3.0, dependable=True)
+    assert batch.left(0.0) == pytest.approx(whole)
 
 
 def test_stages_that_took_no_time_forecast_none() -> None:

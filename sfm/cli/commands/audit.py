@@ -76,8 +76,10 @@ def audit(
             write_result,
         )
         from sfm.report.pages import page_of, texts_of
+        from sfm.runtime.forecast import Run, RunHistory, expected_seconds
         from sfm.runtime.progress_bar import drawn_progress
         from sfm.runtime.threads import cores, one_blas_thread
+        from sfm.survey.inputs.measurements import NO_PHOTOGRAPHS, work_of
         from sfm.survey.inputs.survey import read_survey
 
     with working_on(str(model)):
@@ -102,6 +104,8 @@ def audit(
         lock_folder(folder),
         SurveyLog(watch=drawn) as log,
     ):
+        history, work = RunHistory.of_user(), work_of(audited, NO_PHOTOGRAPHS)
+        drawn.countdown.expected = expected_seconds(work, history.read())
         log.start(audited.name, model, **origin.written(folder))
         with reporting_unfinished(folder, log, pdf=pdf):
             result = run_survey(audited, jobs=cores(), progress=log)
@@ -115,6 +119,7 @@ def audit(
             log.close_into(part, findings)
 
         write_result(findings, folder, finish=finish, progress=log)
+        history.add(Run(work, drawn.finished()))
     print_verdict(page.verdict)
     for note in (*notes, *judged.like):
         print(f"{model}: {note}")

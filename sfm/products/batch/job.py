@@ -144,8 +144,9 @@ def measure_one(survey: SurveyFile, image: str, path: Path, *, send: Send) -> Me
             note = PhotographNote(image, counts, stored=stored)
     except Exception as error:  # an unforeseen error recurs when the survey runs, and fails it there
         note = PhotographNote(image, failed=as_plain(error_in_words(error)))
-    send({"photograph": image})
-    return MeasuredPhotograph(replace(note, seconds=round(time.perf_counter() - begun, 4)), store.held)
+    note = replace(note, seconds=round(time.perf_counter() - begun, 4))
+    send({"photograph": image, "seconds": note.seconds, "stored": note.stored})
+    return MeasuredPhotograph(note, store.held)
 
 
 def reconstruct(
@@ -310,14 +311,16 @@ def _row(job: SurveyJob, entries: dict[str, Any], seconds: float) -> SurveyRow:
     return SurveyRow(file=str(job.file), folder=job.folder, status="done", seconds=seconds, **known)
 
 
-@dataclass(frozen=True)
+@dataclass
 class _Sending(Silent):
-    """Progress that only reports the beginning of stages to the batch."""
+    """Progress that only reports the beginning of stages to the batch, and the time of the one before."""
 
     send: Send
+    begun: float = field(default_factory=time.perf_counter)
 
     def stage(self, name: str, total: int | None = None) -> None:
-        self.send({"stage": name})
+        before, self.begun = self.begun, time.perf_counter()
+        self.send({"stage": name, "before": round(self.begun - before, 4)})
 
 
 def note_finished(folder: Path) -> None:

@@ -45,11 +45,12 @@ from sfm.products.drafting.frames_folder import videos_of
 from sfm.report.output import SurveyLog, folder_name, refuse_other_log, remove_log
 from sfm.report.viewer.pictures import BUDGET_MB
 from sfm.runtime.executor import Call, Done, Engine, Lost, Sent, Work
-from sfm.survey.inputs.measurements import find_photographs, masks_of
+from sfm.runtime.forecast import Work as Extent
+from sfm.survey.inputs.measurements import NO_PHOTOGRAPHS, find_photographs, masks_of, work_of
 from sfm.survey.inputs.named_folders import named_folder
 from sfm.survey.inputs.sources import reads_photographs
 from sfm.survey.inputs.start import refuse_unknown_photographs
-from sfm.survey.inputs.survey import read_survey
+from sfm.survey.inputs.survey import read_survey, survey_of_file
 from sfm.survey.inputs.survey_file import SurveyFile, read_survey_file
 from sfm.survey.measuring.measured_store import MeasuredStore
 
@@ -60,14 +61,18 @@ NONE: Mapping[Path, Exception] = MappingProxyType({})
 class Watch(Protocol):
     """Observer of a running batch."""
 
-    def planned(self, names: Sequence[str]) -> None:
-        """Receive the surveys of the batch, by the names of their folders."""
+    def planned(self, works: Mapping[str, Extent | None], workers: int) -> None:
+        """Receive what the time of each survey depends on, by the names of their folders.
+
+        The number of workers is that of the calls that run at a time.
+        """
 
     def received(self, name: str, message: dict[str, Any]) -> None:
         """Receive a message of a survey.
 
-        The survey has {"photographs": count}, begins {"stage": name}, or has measured {"photograph": name}.
-        With {"compiling": True} its worker compiles kernels first.
+        The survey has {"photographs": count}, begins {"stage": name, "before": s of the one before}, or has
+        measured {"photograph": name, "seconds": s, "stored": whether an earlier run did}. With
+        {"compiling": True} its worker compiles kernels first.
         """
 
     def finished(self, name: str, row: SurveyRow, *, kept: bool) -> None:
@@ -130,9 +135,9 @@ def run_batch(
         if before is not None:
             watch.remark(f"an earlier run was cut off ({before}); what it had finished is safe")
         _remove_half_written(out, plans)
-        watch.planned([plan.folder for plan in plans])
         try:
             with engine as running:
+                watch.planned({plan.folder: _extent_of(plan) for plan in plans}, running.workers)
                 rows = _run(
                     plans,
                     out,
@@ -343,6 +348,19 @@ def _run(
             row = _row_without_result(by_name[event.key], out, "set aside", died)
             finish(event.key, replace(row, fault=True))
     return rows
+
+
+def _extent_of(plan: _Plan) -> Extent | None:
+    """Return what the time of a survey depends on; None where it cannot run."""
+    if isinstance(plan.survey, Exception):
+        return None
+    try:
+        survey, files = survey_of_file(plan.survey), NO_PHOTOGRAPHS
+        if reads_photographs(plan.survey):
+            files = find_photographs(survey, images_dir=named_folder(plan.survey))
+        return work_of(survey, files)
+    except Exception:  # its run states the reason
+        return None
 
 
 def _work(job: SurveyJob, survey: SurveyFile, comparers: Comparers) -> Work:

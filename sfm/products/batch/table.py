@@ -6,7 +6,7 @@ import os
 import signal
 import time
 from collections import Counter
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import astuple, dataclass, fields
 from pathlib import Path
@@ -30,14 +30,15 @@ from sfm.report.page import Column, Link, Mark, Note, Page, Section, Table, Tile
 from sfm.report.pages import texts_of
 from sfm.report.phrases import fixed
 from sfm.runtime.compiling import COMPILING
+from sfm.runtime.forecast import BatchCountdown, RunHistory, Work
+from sfm.runtime.progress_bar import clock_time
+from sfm.runtime.threads import cores
 
 PAGES = ("batch.json", "batch.csv", "index.html")  # the first identifies them
 PRINTED = "index.pdf"  # where it was asked for
 COLOURS = {"good": "green", "fair": "yellow", "bad": "red", "": "red"}
 RECENT = 8  # finished surveys that remain visible
 REFRESHES_PER_SECOND = 4
-MEASURING_SHARE = 0.5  # of the time of a small survey; the rest is adjustment and report
-MIN_DONE_SHARE = 0.05  # of a batch that must be done before the remaining time is stated
 
 
 @dataclass
@@ -58,9 +59,9 @@ class BatchTable:
         self._verbose = verbose
         self._lines: dict[str, _Line] = {}
         self._recent: list[SurveyRow] = []
-        self._left = self._done = self._kept = self._failed = 0
+        self._left = self._done = self._failed = 0
         self._compiling = False
-        self._begun = time.monotonic()
+        self._countdown: BatchCountdown | None = None
         self._live = Live(
             console=console, get_renderable=self._render, refresh_per_second=REFRESHES_PER_SECOND
         )
@@ -75,9 +76,11 @@ class BatchTable:
     ) -> None:
         self._live.stop()
 
-    def planned(self, names: Sequence[str]) -> None:
+    def planned(self, works: Mapping[str, Work | None], workers: int) -> None:
         """Begin with the surveys to run."""
-        self._left, self._begun = len(names), time.monotonic()
+        self._left = len(works)
+        runs = RunHistory.of_user().read()
+        self._countdown = BatchCountdown(works, runs, workers=workers, threads=cores())
 
     def received(self, name: str, message: dict[str, Any]) -> None:
         """Note a message of a survey."""
@@ -89,11 +92,17 @@ class BatchTable:
         if "photograph" in message:
             line.stage = "targets"
             line.photographs += 1
+            if self._countdown is not None:
+                self._countdown.measured(
+                    name, float(message["seconds"]), line.total, stored=bool(message["stored"])
+                )
         if "compiling" in message and not self._compiling:
             self._compiling = True
             self.remark(f"kolinear: the {COMPILING}")
         if "stage" in message:
             line.stage = str(message["stage"])
+            if self._countdown is not None and "before" in message:
+                self._countdown.begin(name, line.stage, time.monotonic(), float(message["before"]))
         if self._verbose:
             what = ", ".join(f"{key} {value}" for key, value in message.items())
             self._console.print(Text(f"  {name}: {what}"), soft_wrap=True)
@@ -101,10 +110,11 @@ class BatchTable:
     def finished(self, name: str, row: SurveyRow, *, kept: bool) -> None:
         """Note the end of a survey."""
         self._lines.pop(name, None)
+        if self._countdown is not None:
+            self._countdown.finish(name, row.seconds, dependable=row.succeeded and not kept)
         self._left -= 1
         self._done += row.succeeded
         self._failed += not row.succeeded
-        self._kept += kept
         self._recent = [*self._recent, row][-RECENT:]
         if (not self._console.is_terminal or self._verbose) and not kept:
             self._console.print(
@@ -118,17 +128,12 @@ class BatchTable:
     def _render(self) -> RenderableType:
         """Return the present table."""
         now = time.monotonic()
-        run = self._done + self._failed - self._kept
-        begun = sum(line.photographs / line.total for line in self._lines.values() if line.total)
-        run_share = (run + MEASURING_SHARE * begun) / max(1, run + self._left)
         text = f"{self._done + self._failed} of {self._done + self._failed + self._left} surveys"
         if self._failed:
             text += f", {self._failed} failed"
-        if run_share >= MIN_DONE_SHARE and self._left:
-            minutes, over = divmod(round((now - self._begun) * (1 / run_share - 1)), 60)
-            hours, minutes = divmod(minutes, 60)
-            rest = f"{minutes} min {over} s" if minutes else f"{over} s"
-            text += f", about {f'{hours} h {minutes} min' if hours else rest} left"
+        left = self._countdown.left(now) if self._countdown is not None else None
+        if left is not None and self._left:
+            text += f", {clock_time(left)} to the end"
         table = RichTable(box=None, padding=(0, 2, 0, 0), caption=text, caption_justify="left")
         for name in ("survey", "stage", "photographs", "seconds"):
             table.add_column(name, justify="right" if name in ("photographs", "seconds") else "left")

@@ -73,11 +73,13 @@ def work_of(survey: Survey, files: PhotographList) -> Work:
         files: its photographs; none if it measures nothing.
     """
     metadata = files.metadata_of(0) if len(files) else None
-    images = {image for table in given_tables(survey) for image in table.image}
+    tables = given_tables(survey)
+    images = {image for table in tables for image in table.image}
     return Work(
         tuple(row.source.name for row in declared(survey)),
         len(files) or len(images),
         0.0 if metadata is None else metadata.size_px[0] * metadata.size_px[1] / 1e6,
+        0 if len(files) else sum(len(table.image) for table in tables),
     )
 
 
