@@ -397,7 +397,7 @@ FORMATS = (
         read_all=read_resection,
         keeps=frozenset({"exterior orientations", "image names", "exterior"}),
         names=(False, True),
-        recognises=lambda head: head.startswith("{") and '"solutions"' in head,
+        recognises=lambda head: head.startswith(("{", "[")) and '"solutions"' in head,
     ),
     FileFormat(
         name="agisoft-reference",

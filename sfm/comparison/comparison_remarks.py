@@ -14,7 +14,7 @@ from sfm.model.remarks.verdict import Level, Verdict, judge
 from sfm.model.solution import MAX_POINTS
 
 HEADLINES: Mapping[Level, str] = {
-    "good": "The points do not differ significantly.",
+    "good": "The results do not differ significantly.",
     "fair": "The results were compared, and not tested.",
     "bad": "The results differ significantly.",
 }
@@ -79,6 +79,15 @@ def _remarks(comparison: ResultComparison) -> Iterator[Remark]:
     if comparison.cause is not None:
         yield from remarks_of_cause(
             comparison.cause, first, second, len(comparison.points), (float(longest.max()), unit)
+        )
+    elif comparison.changed and comparison.poses is not None:
+        poses = comparison.poses
+        differ = [name for name, flag in zip(comparison.images, poses.significant, strict=True) if flag]
+        yield remark(
+            "points_differ",
+            photographs=differ,
+            orientation=float(np.nanmax(poses.statistic)),
+            critical=poses.critical,
         )
     elif comparison.changed:
         names = [

@@ -30,6 +30,7 @@ from sfm.comparison.pairing import (
     pairs_of_results,
     rounding_of,
 )
+from sfm.comparison.pose_test import PoseTest, compare_poses, has_pose_sigma
 from sfm.comparison.solutions import rotation_angle_deg
 from sfm.comparison.stable_points import critical_value
 from sfm.comparison.weaker_solution import Weakness, weaker_solutions
@@ -68,7 +69,7 @@ class ResultComparison:
 
     names: tuple[str, str]
     unit: str  # unit of a's lengths, for people; empty if unknown
-    has_sigma: tuple[bool, bool]  # whether standard deviations of points of a and of b are known
+    has_sigma: tuple[bool, bool]  # whether standard deviations of points of a and of b are known, or of poses
     same_share: float  # share of a's image points that b also has; NaN if a has none
     pairing: Pairing  # common points and photographs
     alignment: str  # points | cameras | control | none
@@ -88,6 +89,7 @@ class ResultComparison:
     majority: bool  # whether most of the points agree; if not, the moved points are unknown
     cause: Cause | None  # cause of the differences; None if single points moved, or without a cause
     images: tuple[str, ...]  # names in a of the common photographs, (m,)
+    poses: PoseTest | None  # of common photographs without common points; None if they are not tested
     position_difference: FloatArray  # of projection centres, object unit of a, (m, 3)
     rotation_deg: FloatArray  # angle between the rotations, deg, (m,)
     interior: tuple[InteriorDifference, ...]  # of cameras that share photographs
@@ -106,7 +108,10 @@ class ResultComparison:
         if self.untested is not None:
             return None
         return bool(
-            self.global_statistic > self.global_critical or self.significant.any() or not self.majority
+            self.global_statistic > self.global_critical
+            or self.significant.any()
+            or not self.majority
+            or (self.poses is not None and self.poses.significant.any())
         )
 
     def _rows(self) -> list[tuple[str, str]]:
@@ -114,6 +119,9 @@ class ResultComparison:
         test = f"{int(self.significant.sum())} of {len(self.points)} points moved"
         if self.untested is not None:
             test = self.untested.text
+        elif self.poses is not None:
+            tested = int(np.isfinite(self.poses.statistic).sum())
+            test = f"{int(self.poses.significant.sum())} of {tested} photographs differ"
         elif self.cause is not None or not self.majority:
             test = "the points differ as a whole"
         return [
@@ -135,23 +143,29 @@ def compare_results(
     a: Solution,
     b: Solution,
     *,
-    align: str = "points",
+    align: str | None = None,
     control: tuple[str, ...] = (),
     alpha: float = FALSE_ALARM,
 ) -> ResultComparison:
     """Align b to a and test the differences.
 
+    Where no points are common, the exterior orientations of photographs are tested, if they are in one
+    coordinate system.
+
     Args:
         a: first result.
         b: second result.
         align: points (all common points that did not move), cameras (projection centres), control (the named
-            points) or none.
+            points) or none. If not given, points, or none for results that have no points at all.
         control: names in a of the points for align = control.
         alpha: probability of reporting a change if there is none.
 
     Raises:
         GeometryError: an unknown alignment, too little in common for it, or nothing in common at all.
     """
+    if align is None:
+        without = not (a.estimate.determined.any() or b.estimate.determined.any())
+        align = "none" if without else "points"
     if align not in ALIGNMENTS:
         raise GeometryError(f"comparison: align '{align}', expected one of {', '.join(ALIGNMENTS)}")
     pairing = pair_results(a, b)
@@ -170,6 +184,9 @@ def compare_results(
     moved = transform.apply_estimate(b.estimate)
     pairs = pairs_of_results(a, b, pairing.points, scale)
     test = judge_points(a, b, pairing, pairs, transform, align, chosen, alpha)
+    poses = compare_poses(a, b, pairing.images, alpha) if align == "none" and not len(pa) else None
+    if poses is not None:
+        test = replace(test, untested=None)
     if same_share > SAME_SHARE:
         same = remark("same_image_points", share=same_share, first=a.name, second=b.name)
         test = replace(test, untested=same)
@@ -184,10 +201,11 @@ def compare_results(
         agrees = tested and test.agrees
         cause = find_cause(points, reference=chosen[free], changed=not agrees)
     nothing = np.full(len(pa), np.nan)
+    known = has_sigma if poses is None else has_pose_sigma
     return ResultComparison(
         names=(a.name, b.name),
         unit=a.unit,
-        has_sigma=(has_sigma(a), has_sigma(b)),
+        has_sigma=(known(a), known(b)),
         same_share=same_share,
         pairing=pairing,
         alignment=align,
@@ -207,6 +225,7 @@ def compare_results(
         majority=test.majority,
         cause=cause,
         images=tuple(a.network.images[i] for i in ia),
+        poses=poses,
         position_difference=moved.position[ib] - a.estimate.position[ia],
         rotation_deg=rotation_angle_deg(a.estimate.rotation[ia], moved.rotation[ib]),
         interior=_interior(a, b, ia, ib),

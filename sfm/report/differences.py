@@ -33,6 +33,9 @@ PICTURE = (
     "Differences of the points. Arrows show the part in the object's main plane, red if significant; the "
     "colour of the dots shows the part out of the plane."
 )
+ANGLES = ("omega", "phi", "kappa")
+ELEMENTS = ("X0", "Y0", "Z0", *ANGLES)
+IN_DEG = np.array([1.0, 1.0, 1.0, *[math.degrees(1.0)] * 3])  # elements in object unit and deg, from rad
 VALUES = (Column(), Column("value", format=str), Column("unit"))
 
 
@@ -83,6 +86,7 @@ def page(comparison: ResultComparison, *, xyz: FloatArray) -> Page:
         (
             Section("Figures", _figures(comparison, known), note),
             Section("Test", *_test(comparison, tested)),
+            Section("Photographs", *_poses(comparison)),
             Section("Picture", picture),
             *cameras,
             tested_section(verdict),
@@ -140,6 +144,62 @@ def _test(comparison: ResultComparison, tested: int) -> tuple[Part, ...]:
     return Table(columns, rows), Note(f"{words}; chance alone gives about 1.")
 
 
+def elements_table(comparison: ResultComparison) -> Table:
+    """Return the differences of the elements of exterior orientation, with their standard deviations.
+
+    Args:
+        comparison: with tested photographs.
+    """
+    poses, unit = comparison.poses, comparison.unit or "object units"
+    columns = (
+        Column("photograph", "photograph"),
+        Column("element", "element"),
+        Column("difference", "difference", format=".4g"),
+        Column("sigma", "sigma", format=".2g", unknown="not known"),
+        Column("unit", "unit"),
+        Column("in sigma", "in_sigma", format="+.2f", unknown="-"),
+    )
+    rows = []
+    for k, image in enumerate(comparison.images if poses is not None else ()):
+        assert poses is not None
+        values = zip(
+            ELEMENTS, poses.difference[k] * IN_DEG, poses.sigma[k] * IN_DEG, poses.sigmas[k], strict=True
+        )
+        rows += [
+            (image, name, difference, sigma, "deg" if name in ANGLES else unit, ratio)
+            for name, difference, sigma, ratio in values
+        ]
+    return Table(columns, rows, "elements")
+
+
+def _poses(comparison: ResultComparison) -> tuple[Part, ...]:
+    """Return the tests of the exterior orientations, and their differences."""
+    poses = comparison.poses
+    if poses is None:
+        return ()
+    columns = (
+        Column("photograph", "photograph"),
+        Column("T", "T", format=significant),
+        Column("chi-square", "chi_square", format=significant),
+        Column("critical value of T", "critical", format=significant),
+        Column("significant", "significant", flag=YES),
+    )
+    tests = [
+        (image, statistic, 6 * statistic, poses.critical, flag)
+        for image, statistic, flag in zip(comparison.images, poses.statistic, poses.significant, strict=True)
+    ]
+    law = (
+        "chi-square has 6 degrees of freedom"
+        if poses.redundancy is None
+        else f"T has the F distribution of 6 and {poses.redundancy} degrees of freedom"
+    )
+    words = (
+        "Chi-square = d' (Qa + Qb)^-1 d for the difference d of the six elements, and T a sixth of it. "
+        f"Measured separately and without any change, {law}, and T is about 1."
+    )
+    return Table(columns, tests, "orientations"), Note(words), elements_table(comparison)
+
+
 def _camera(interior: InteriorDifference, second: str) -> tuple[Part | None, ...]:
     columns = (
         Column("parameter"),
@@ -186,6 +246,7 @@ def _summary(comparison: ResultComparison, tested: int) -> dict[str, Any]:
         "untested": comparison.untested and comparison.untested.kind,
         "approximate": comparison.approximate,
         "tested": tested,
+        "exterior_orientation": _summary_of_poses(comparison),
         "global_test": {"statistic": comparison.global_statistic, "critical": comparison.global_critical},
         "significant": list(compress(comparison.points, comparison.significant)),
         "cameras": [
@@ -203,6 +264,24 @@ def _summary(comparison: ResultComparison, tested: int) -> dict[str, Any]:
     }
 
 
+def _summary_of_poses(comparison: ResultComparison) -> list[dict[str, Any]]:
+    """Return the differences of X0, Y0, Z0 (object unit), omega, phi, kappa (deg) and their tests."""
+    poses = comparison.poses
+    if poses is None:
+        return []
+    return [
+        {
+            "photograph": image,
+            "difference": poses.difference[k] * IN_DEG,
+            "sigma": poses.sigma[k] * IN_DEG,
+            "statistic": poses.statistic[k],
+            "critical": poses.critical,
+            "redundancy": poses.redundancy,
+        }
+        for k, image in enumerate(comparison.images)
+    ]
+
+
 def describe_pairing(comparison: ResultComparison) -> str:
     """Return in words how many points are common and how they were matched."""
     pairing = comparison.pairing
@@ -218,7 +297,7 @@ def describe_pairing(comparison: ResultComparison) -> str:
 def describe_scale(comparison: ResultComparison) -> str:
     """Return in words how the alignment treated the scale."""
     if comparison.alignment == "none":
-        return "not aligned"
+        return "not aligned" if comparison.points else "not aligned, as no points are common"
     if not comparison.scale_estimated:
         return "scale kept: both results are scaled"
     return f"scale estimated, {comparison.a_from_b.scale:.9g}: not both results are scaled"
@@ -234,7 +313,11 @@ def largest_pose_difference(comparison: ResultComparison) -> str:
     """Return the largest difference of a projection centre with its unit, and of a rotation."""
     of_unknown = f"object units of {comparison.names[0]}"
     position = length_of(_longest(comparison.position_difference), comparison.unit, of_unknown=of_unknown)
-    return f"{position} and {significant(_largest(comparison.rotation_deg))} deg"
+    said = f"{position} and {significant(_largest(comparison.rotation_deg))} deg"
+    if comparison.poses is None:
+        return said
+    statistic = _largest(comparison.poses.statistic[np.isfinite(comparison.poses.statistic)])
+    return f"{said}; T {significant(statistic)}, limit {significant(comparison.poses.critical)}"
 
 
 def _largest(values: FloatArray) -> float:

@@ -95,7 +95,7 @@ _TEXTURE = "tie points, orientation, matching, adjustment, comparison, report"
 # are found and tried.
 TYPICAL = (
     _typical(Work(("targets",), 21, 3.87), _TARGETS, 3.5, 0.2, 0.4, 7.6, 0.7, 1.6),
-    _typical(Work(("targets",), 28, 0.31), _TARGETS, 1.2, 0.1, 0.7, 6.6, 0.3, 1.2),
+    _typical(Work(("targets",), 28, 0.31), _TARGETS, 1.2, 0.1, 0.3, 6.6, 0.4, 1.2),
     _typical(Work(("targets",), 12, 1.92), _TARGETS, 4.3, 0.4, 0.3, 0.3, 0.4, 1.2),
     _typical(Work(("texture",), 11, 6.29), _TEXTURE, 7.0, 2.0, 12.0, 8.0, 2.0, 6.0),
     _typical(

@@ -19,8 +19,13 @@ def compare(
     a: Annotated[Path, typer.Argument(metavar="A", help="Result, or a file of cameras.")],
     b: Annotated[Path, typer.Argument(metavar="B", help="Result to compare with A.")],
     align: Annotated[
-        str, typer.Option("--align", help="Align B to A by points, cameras, control or none.")
-    ] = "points",
+        str | None,
+        typer.Option(
+            "--align",
+            help="Align B to A by points, cameras, control or none.  [default: points; none where neither "
+            "has any]",
+        ),
+    ] = None,
     control: Annotated[
         str, typer.Option("--control", metavar="P,Q,R", help="Names of the points for --align control.")
     ] = "",
@@ -56,7 +61,8 @@ def compare(
 ) -> None:
     """Compare two results, or two calibrated cameras.
 
-    Of results, reports differences, their standard deviations, and which differences are significant. If A or
+    Of results, reports differences, their standard deviations, and which differences are significant; without
+    common points, those of the exterior orientations, as of two files of resect --json. If A or
     B is a file of cameras, or with --cameras, reports where both image the same directions: the difference in
     px over the photograph after the rotation that it implies, in standard deviations where they are known.
     """
@@ -71,6 +77,7 @@ def compare(
         from sfm.report.differences import (
             describe_pairing,
             describe_scale,
+            elements_table,
             largest_difference,
             largest_pose_difference,
         )
@@ -104,5 +111,7 @@ def compare(
         print(f"largest difference of a point: {largest_difference(comparison)}")
     elif comparison.images:
         print(f"largest difference of a photograph: {largest_pose_difference(comparison)}")
+        if comparison.poses is not None:
+            print(elements_table(comparison).text)
     print_page("Report", page, pdf=pdf)
     exit_by(verdict)

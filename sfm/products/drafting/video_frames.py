@@ -237,7 +237,7 @@ def choose_of_all(ways: Sequence[Way], count: int | None = None) -> tuple[Chosen
             nearest, places = np.unique(nearest[filmed], return_index=True)
             shared = moved[filmed][places] <= SAME_PLACE_RAD
             moment_of = dict(zip(nearest[shared].tolist(), at[filmed][places][shared].tolist(), strict=True))
-            frames_of = np.union1d(nearest, _frames_outside(ways[k], way, clock, count))
+            frames_of = _with_frames_outside(nearest, ways[k], way, clock, count)
             if not len(frames_of):
                 frames_of = choose_frames(ways[k], count)
             own = np.maximum(ways[k].times_s[frames_of] - clock.ahead_s, 0.0)
@@ -245,25 +245,53 @@ def choose_of_all(ways: Sequence[Way], count: int | None = None) -> tuple[Chosen
             moments = [
                 moment_of.get(frame, time) for frame, time in zip(frames_of.tolist(), own, strict=True)
             ]
-            chosen[k] = ChosenFrames(frames_of, np.array(moments), first, clock.ahead_s, len(moment_of))
+            shown = int(np.isin(frames_of, list(moment_of)).sum())
+            chosen[k] = ChosenFrames(frames_of, np.array(moments), first, clock.ahead_s, shown)
     return tuple(chosen[k] for k in range(len(ways)))
 
 
-def _frames_outside(way: Way, reference: Way, clock: ClockDifference, count: int | None) -> IntArray:
-    """Return frames of a video before another begins and after it ends, none if their number is stated."""
+def _with_frames_outside(
+    inside: IntArray, way: Way, reference: Way, clock: ClockDifference, count: int | None
+) -> IntArray:
+    """Return the frames of a video, in order, with those before another begins and after it ends.
+
+    A stated number of frames is divided by how far the camera moves within the other video and outside.
+
+    Args:
+        inside: frames near those of the other video.
+        way: that of the camera.
+        reference: that of the camera of the other video.
+        clock: of the camera.
+        count: see `choose_frames`.
+    """
     at = way.times_s - clock.ahead_s
-    frames = [np.zeros(0, dtype=np.int64)]
+    parts = []
     for outside in (at < reference.times_s[0], at > reference.times_s[-1]):
         rows = np.flatnonzero(outside)
-        if count is None and len(rows) and np.ptp(way.way_rad[rows]) >= SPACING_RAD:
+        if len(rows) and np.ptp(way.way_rad[rows]) >= SPACING_RAD:
+            parts.append(rows)
+    numbers: list[int | None] = [None] * len(parts)
+    if count is not None:
+        gone = [float(np.ptp(way.way_rad[rows])) for rows in parts]
+        of_all = max(float(np.ptp(way.way_rad)), sum(gone))
+        # what the other video lacks of them is outside of it
+        shares = [max(part / of_all, part / sum(gone) * (1 - len(inside) / count)) for part in gone]
+        up_to = np.minimum(np.round(count * np.cumsum(shares)), count).astype(int).tolist()
+        numbers = list(np.diff([0, *up_to]).tolist())
+        left = count - max(up_to, default=0)
+        if left < len(inside):
+            inside = inside[np.unique(np.linspace(0, len(inside) - 1, left).round().astype(np.int64))]
+    frames = [inside]
+    for rows, number in zip(parts, numbers, strict=True):
+        if number != 0:
             part = Way(
                 way.times_s[rows],
                 way.way_rad[rows] - way.way_rad[rows[0]],
                 way.sharpness[rows],
                 way.speed[rows],
             )
-            frames.append(rows[choose_frames(part)])
-    return np.concatenate(frames)
+            frames.append(rows[choose_frames(part, number)])
+    return np.unique(np.concatenate(frames))
 
 
 def _nearest(way: Way, at: FloatArray, clock: ClockDifference) -> tuple[IntArray, FloatArray]:
@@ -307,7 +335,9 @@ def _relative(sharpness: FloatArray) -> FloatArray:
     return sharpness / usual if usual > 0 else sharpness
 
 
-def write_frames(video: Video, chosen: ChosenFrames, folder: Path, name: str) -> tuple[str, ...]:
+def write_frames(
+    video: Video, chosen: ChosenFrames, folder: Path, name: str, progress: Progress = SILENT
+) -> tuple[str, ...]:
     """Write frames as JPEG files whose EXIF data state one camera; return their names.
 
     Args:
@@ -315,13 +345,16 @@ def write_frames(video: Video, chosen: ChosenFrames, folder: Path, name: str) ->
         chosen: the frames.
         folder: where they are written.
         name: begins their names, and tells the cameras of several videos apart.
+        progress: receives a step for every frame that is decoded.
 
     Raises:
         PhotographError: a frame cannot be decoded any more.
     """
     wanted = dict(zip(chosen.frames.tolist(), chosen.moments_s.tolist(), strict=True))
     names = list[str]()
+    progress.stage("writing", max(wanted) + 1)
     for frame in video.frames():
+        progress.advance(f"{frame.time_s:.1f} s")
         if frame.index in wanted:
             names.append(f"{name}-{round(1000 * wanted[frame.index]):07d}ms.jpg")
             exif = Image.Exif()
@@ -423,7 +456,7 @@ def extract_frames(
         alike = [other for other in videos if other.stem.casefold() == path.stem.casefold()]
         name = as_plain(path.stem if len(alike) < 2 else path.name.replace(".", "-"))
         with opened_video(path) as video:
-            names = write_frames(video, chosen, folder, name)
+            names = write_frames(video, chosen, folder, name, progress)
         if len(names) == 1 < len(way.times_s):
             why = "the camera does not move" if way.followed else "its pictures show nothing to follow"
             said.append(f"{why}: one frame is taken; film the object from several places, in good light")

@@ -41,18 +41,50 @@ def test_the_pose_and_its_covariance_are_read(pose: Path) -> None:
     unit = np.array([1, 1, 1, *[np.pi / 180] * 3])
     expected = np.array(printed["dispersion"]) * np.outer(unit, unit)
     np.testing.assert_allclose(network.exterior.covariance[0], expected, rtol=1e-9)
+    np.testing.assert_allclose(result.exterior_covariance, expected[None], rtol=1e-9)
+    assert result.redundancy == printed["redundancy"] > 0
 
 
-def test_two_resections_are_compared(pose: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+@pytest.mark.parametrize(("off", "code"), [(0.1, 0), (1.0, 1)])  # X0 and phi are correlated
+def test_two_resections_are_compared_and_tested(
+    pose: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str], off: float, code: int
+) -> None:
     printed = json.loads(pose.read_text("utf-8"))
-    printed["solutions"][0]["X0"] += 0.25
-    other = tmp_path / "other.json"
+    sigma = np.sqrt(2.0 * printed["dispersion"][0][0])  # of the difference
+    printed["solutions"][0]["X0"] += off * sigma
+    other, out = tmp_path / "other.json", tmp_path / "out"
     other.write_text(json.dumps(printed), "utf-8")
-    code = kolinear("compare", pose, other, "--align", "none", "--out", tmp_path / "out")
+    assert kolinear("compare", pose, other, "--out", out) == code
     told = capsys.readouterr().out
-    assert code == 0 and "0 common points, 1 common photograph; not aligned" in told
-    assert "largest difference of a photograph: 0.250 object units of" in told and " and 0 deg" in told
-    assert (tmp_path / "out" / "comparison.html").is_file()
+    assert "0 common points, 1 common photograph; not aligned, as no points are common" in told
+    assert f"{off:+.2f}" in told and " and 0 deg" in told
+    assert ("The exterior orientation of 9.jpg differs significantly" in told) == bool(code)
+    written = json.loads((out / "comparison.json").read_text("utf-8"))
+    (tested,) = written["exterior_orientation"]
+    np.testing.assert_allclose(tested["difference"], [off * sigma, 0, 0, 0, 0, 0], atol=1e-9)
+    assert tested["sigma"][0] == pytest.approx(sigma)
+    # only X0 differs: its weight in the inverse of twice the covariance of one
+    weight = np.linalg.inv(2.0 * np.array(printed["dispersion"]))[0, 0]
+    assert tested["statistic"] == pytest.approx((off * sigma) ** 2 * weight / 6)
+    assert (tested["statistic"] > tested["critical"]) == bool(code) == written["changed"]
+    told = (out / "comparison.html").read_text("utf-8")
+    assert f"6 and {printed['redundancy']} degrees of freedom" in told
+
+
+def test_an_alignment_that_is_asked_for_is_not_replaced(
+    pose: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    assert kolinear("compare", pose, pose, "--align", "points", "--out", tmp_path / "out") == 2
+    assert "0 points in common, alignment needs 3" in capsys.readouterr().err
+
+
+def test_results_of_all_methods_are_refused(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    kolinear("resect", LAB / "photograph_9.csv", "--c", "152.67", "--method", "all", "--json")
+    path = tmp_path / "all.json"
+    path.write_text(capsys.readouterr().out, "utf-8")
+    assert kolinear("compare", path, path) == 2
+    told = capsys.readouterr().err.splitlines()
+    assert len(told) == 1 and "all.json: has the results of all methods; expected those of one" in told[0]
 
 
 @pytest.mark.parametrize(
@@ -63,6 +95,7 @@ def test_two_resections_are_compared(pose: Path, tmp_path: Path, capsys: pytest.
         ({"dispersion": [1, 2]}, "dispersion"),
         ({"dispersion": (-np.eye(6)).tolist()}, "dispersion is no covariance: the variances"),
         ({"dispersion": (np.eye(6) + np.eye(6, k=1)).tolist()}, "dispersion is no covariance, which is"),
+        ({"redundancy": 0}, "redundancy is 0, expected a whole number from 1"),
         ({"dispersion": (3 * np.ones((6, 6)) - 2.5 * np.eye(6)).tolist()}, "dispersion is no covariance"),
     ],
 )

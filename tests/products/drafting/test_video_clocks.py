@@ -133,6 +133,28 @@ def test_what_only_one_of_two_videos_shows_gives_frames_too() -> None:
     assert all(len(chosen.frames) == 1 for chosen in choose_of_all([long, short], 1))
 
 
+@pytest.mark.parametrize(("begin", "end"), [(20, 35), (0, 40), (25, 60)])
+@pytest.mark.parametrize("count", [1, 2, 12])
+def test_a_stated_number_of_frames_is_spread_over_all_of_a_video(begin: int, end: int, count: int) -> None:
+    motion = speeds(seed_of("long and short"), 60.0)
+    short = way_of(motion, np.arange(begin, end, 1 / 25), 0.0)
+    long = way_of(motion, np.arange(0, 60, 1 / 25), 0.0)
+    first, second = choose_of_all([short, long], count)
+    assert second.reference == 0
+    assert len(first.frames) == len(second.frames) == count == len(set(second.frames.tolist()))
+    gaps = np.diff([0.0, *long.way_rad[second.frames], long.way_rad[-1]])
+    assert gaps.max() < 3.1 * long.way_rad[-1] / max(count, 2)  # the largest part without a frame
+
+
+def test_videos_of_one_length_that_begin_apart_share_what_both_show() -> None:
+    motion = speeds(seed_of("apart"), 60.0)
+    ways = [way_of(motion, np.arange(begin, begin + 40, 1 / 25), 0.0) for begin in (0, 20)]
+    first, second = choose_of_all(ways, 16)
+    at = ways[1].times_s[second.frames]
+    assert len(first.frames) == len(at) == 16 and at.min() < 25 and at.max() > 55
+    assert 5 <= (at > 40).sum() <= 11
+
+
 @pytest.mark.filterwarnings("error")
 def test_frames_without_any_structure_are_compared() -> None:
     motion = speeds(seed_of("black"), 30.0)

@@ -23,6 +23,7 @@ from sfm.products.drafting.video_frames import (
     extract_frames,
     follow_camera,
 )
+from sfm.runtime.progress import Silent
 from sfm.survey.inputs.survey_file import read_survey_file
 from tests.commands import kolinear, refused
 from tests.surveys import code_centres
@@ -354,3 +355,23 @@ def test_a_picture_of_a_cover_is_no_video(tmp_path: Path, capsys: pytest.Capture
         container.mux(cover.encode(picture))
         container.mux(cover.encode())
     assert "has no video, only a cover" in refused(capsys, "run", tmp_path / "music.mp4")
+
+
+def test_both_decodings_of_a_video_are_announced(tmp_path: Path) -> None:
+    class Counts(Silent):
+        def __init__(self) -> None:
+            self.stages: list[list[object]] = []
+
+        def stage(self, name: str, total: int | None = None) -> None:
+            self.stages.append([name, total, 0])
+
+        def advance(self, step: str = "") -> None:
+            self.stages[-1][2] = int(str(self.stages[-1][2])) + 1
+
+    video = write_video(tmp_path / "clip.mp4", orbit(np.linspace(0, 0.5, 12), seed="announced"), rate=12)
+    (tmp_path / "frames").mkdir()
+    counts = Counts()
+    (written,) = extract_frames([video], tmp_path / "frames", progress=counts)
+    (decoded, _, frames), (writing, last, again) = counts.stages
+    assert (decoded, writing) == ("frames", "writing") and frames == written.frames == 12
+    assert last == again <= 12

@@ -116,11 +116,12 @@ ROWS = (
         "points_differ",
         "error",
         "[[{differing:point} of {tested} {differing:differs|differ} significantly, by up to {distance}: "
-        "{points}]][[The points differ as a whole (T {statistic}, limit {critical}), but no single point "
+        "{points}]][[The exterior orientation of {photographs} differs significantly: T {orientation}, limit "
+        "{critical}]][[The points differ as a whole (T {statistic}, limit {critical}), but no single point "
         "does]].",
-        "points moved between the surveys, an observation of one of them is wrong, or standard deviations "
-        "are too small",
-        "See the table of points, and look for a pattern in the figure.",
+        "points or photographs moved between the surveys, an observation of one of them is wrong, or "
+        "standard deviations are too small",
+        "See the table of points or photographs, and look for a pattern in the figure.",
     ),
     Kind(
         "no_majority_agrees",
