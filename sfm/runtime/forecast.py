@@ -24,18 +24,19 @@ OTHERS_APART = math.log(8.0)  # a run of the user is preferred to a typical one 
 EXPECTED_SIGMA, PARTS_SIGMA = 0.3, 0.7
 LARGEST = 1e6  # of photographs, of 10^6 pixels and of seconds, which no survey reaches
 STORED_SHARE = 0.2  # of its expected time, below which a stage read what an earlier run measured
-# How the time of a stage grows with photographs, and with the pixels of each. Tie points, windows and the
-# pictures of the report are limited in number, but sought in all pixels.
+# How the time of a stage grows with photographs, with the pixels of each, and with given image points, which
+# take the place of photographs. Tie points, windows and the pictures of the report are limited in number, but
+# sought in all pixels. Of given points, by audits of camcal and fountain-P11.
 GROWTH = {
-    "photographs": (1.0, 1.0),
-    "targets": (1.0, 1.0),
-    "tie points": (1.0, 0.5),
-    "matching": (1.0, 0.5),
-    "report": (0.7, 0.5),
-    "adjustment": (1.2, 0.0),
-    "comparison": (1.2, 0.0),
+    "photographs": (1.0, 1.0, 0.0),
+    "targets": (1.0, 1.0, 0.0),
+    "tie points": (1.0, 0.5, 0.0),
+    "matching": (1.0, 0.5, 0.0),
+    "report": (0.7, 0.5, 0.15),
+    "adjustment": (1.2, 0.0, 0.6),
+    "comparison": (1.2, 0.0, 0.6),
 }
-OTHER_GROWTH = (1.0, 0.0)
+OTHER_GROWTH = (1.0, 0.0, 0.6)
 MEASURED = ("photographs", "targets", "tie points")  # stages that measure several photographs at a time
 
 
@@ -74,13 +75,13 @@ class Run:
     def scaled_to(self, work: Work) -> dict[str, float]:
         """Return the time that each stage would take for another survey of these sources, s."""
         of_number = max(1, work.photographs) / max(1, self.work.photographs)
-        if self.work.image_points:
-            of_number = work.image_points / self.work.image_points
         of_size = work.megapixels / self.work.megapixels if self.work.megapixels else 1.0
+        of_points = work.image_points / self.work.image_points if self.work.image_points else 0.0
         scaled = {}
         for stage, seconds in self.seconds.items():
-            by_number, by_size = GROWTH.get(stage, OTHER_GROWTH)
-            scaled[stage] = seconds * of_number**by_number * of_size**by_size
+            by_number, by_size, by_points = GROWTH.get(stage, OTHER_GROWTH)
+            of_stage = of_points**by_points if of_points else of_number**by_number * of_size**by_size
+            scaled[stage] = seconds * of_stage
         return scaled
 
 
@@ -89,10 +90,11 @@ def _typical(work: Work, stages: str, *seconds: float) -> Run:
 
 
 _TARGETS = "targets, orientation, matching, adjustment, comparison, report"
+_GIVEN = "orientation, adjustment, comparison, report"
 _TEXTURE = "tie points, orientation, matching, adjustment, comparison, report"
 # Two cores of 2.5 GHz, 2026-11: camcal, stereo-chessboard, the demo, fountain-P11, a sheet of targets on
-# texture, and the image points of stereo10. In the first two, whose photographs are real, causes of errors
-# are found and tried.
+# texture, and the image points of stereo10, camcal and fountain-P11. In the first two, whose photographs are
+# real, causes of errors are found and tried.
 TYPICAL = (
     _typical(Work(("targets",), 21, 3.87), _TARGETS, 3.5, 0.2, 0.4, 7.6, 0.7, 1.6),
     _typical(Work(("targets",), 28, 0.31), _TARGETS, 1.2, 0.1, 0.3, 6.6, 0.4, 1.2),
@@ -103,9 +105,9 @@ TYPICAL = (
         "photographs, targets, tie points, orientation, matching, adjustment, comparison, report",
         *(6.1, 0.1, 4.6, 1.9, 9.2, 3.7, 1.0, 4.0),
     ),
-    _typical(
-        Work(("given",), 10, 0.0, 20), "orientation, adjustment, comparison, report", 0.4, 0.1, 0.1, 0.6
-    ),
+    _typical(Work(("given",), 2, 0.0, 20), _GIVEN, 0.1, 0.1, 0.1, 0.6),
+    _typical(Work(("given",), 21, 0.0, 2049), _GIVEN, 0.2, 2.9, 0.4, 1.6),
+    _typical(Work(("given",), 11, 0.0, 30331), _GIVEN, 0.5, 15.0, 2.0, 2.4),
 )
 
 

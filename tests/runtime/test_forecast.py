@@ -120,7 +120,7 @@ def test_surveys_of_given_image_points_are_scaled_by_these() -> None:
     few = Run(Work(("given",), 10, 0.0, 100), {"adjustment": 1.0, "orientation": 2.0})
     many = Run(Work(("given",), 10, 0.0, 100_000), {"adjustment": 1000.0, "orientation": 20.0})
     expected = expected_seconds(Work(("given",), 40, 0.0, 50_000), [many, few])
-    assert expected == pytest.approx({"adjustment": 1000.0 * 0.5**1.2, "orientation": 10.0})
+    assert expected == pytest.approx({"adjustment": 1000.0 * 0.5**0.6, "orientation": 20.0 * 0.5**0.6})
 
 
 def test_a_stage_that_finds_more_to_do_says_nothing_of_the_others() -> None:

@@ -105,7 +105,8 @@ def audit(
         SurveyLog(watch=drawn) as log,
     ):
         history, work = RunHistory.of_user(), work_of(audited, NO_PHOTOGRAPHS)
-        drawn.countdown.expected = expected_seconds(work, history.read())
+        expected = expected_seconds(work, history.read())
+        drawn.countdown.expected = {stage: s for stage, s in expected.items() if stage != "comparison"}
         log.start(audited.name, model, **origin.written(folder))
         with reporting_unfinished(folder, log, pdf=pdf):
             result = run_survey(audited, jobs=cores(), progress=log)
