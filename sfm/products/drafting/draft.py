@@ -540,12 +540,14 @@ def _remarks(content: _Content) -> tuple[Remark, ...]:
     assumed = [camera.name for camera in grouping.cameras if camera.assumed]
     if assumed:
         remarks.append(remark("camera_assumed", cameras=assumed))
-    # cameras of one size, or of one body, may be one
-    of_size = Counter(camera.size_px for camera in grouping.cameras)
-    of_body = Counter(camera.body for camera in grouping.cameras)
+    # cameras of one size, or of one body, may be one; those of a rig are two
+    of_rig = () if grouping.rig is None else grouping.rig.cameras
+    alone = [camera for camera in grouping.cameras if camera.name not in of_rig]
+    of_size = Counter(camera.size_px for camera in alone)
+    of_body = Counter(camera.body for camera in alone)
     alike = [
         f"{camera.name} ({len(camera.photographs)} of {camera.size_px[0]} x {camera.size_px[1]} px)"
-        for camera in grouping.cameras
+        for camera in alone
         if max(of_size[camera.size_px], of_body[camera.body]) > 1
     ]
     if alike:

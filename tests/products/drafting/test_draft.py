@@ -282,8 +282,10 @@ def test_names_that_pair_up_are_two_cameras_with_a_rig(tmp_path: Path) -> None:
     """Each moment was taken for a camera."""
     for k in range(12):
         Image.new("L", (120, 80), 9 * k).save(tmp_path / f"dot_{k // 2:02d}_{k % 2}.png")
-    read = tomllib.loads(draft_survey(tmp_path).text)
+    draft = draft_survey(tmp_path)
+    read = tomllib.loads(draft.text)
     assert len(read["camera"]) == 2 and len(read["rig"]) == 1
+    assert "several_cameras" not in [said.kind for said in draft.remarks]  # nobody takes them for one
 
 
 def test_names_by_date_and_time_are_one_camera(tmp_path: Path) -> None:
