@@ -123,8 +123,8 @@ def test_windows_show_another_place_where_targets_moved(monkeypatch: pytest.Monk
     """Whether a test of alternatives found it, or rejected image points that agree."""
     network, truth = make_network(seed_of("elsewhere"), images=8, points=POINTS, free=("c",))
     moved = [
-        remark("points_moved", points=[name], distance=0.1, shift=9.0, wrong=1.0, **{"from": "image 5"})
-        for name in ("7", "17")
+        remark("points_moved", points=[name], distance=away, shift=9.0, wrong=1.0, **{"from": image})
+        for name, away, image in (("7", 0.1, "image 5"), ("17", 0.2, "image 6"))
     ]
     monkeypatch.setattr(
         solved_survey, "judge_alternatives", lambda *_, **__: JudgedAssumptions(causes=(moved[0],))
@@ -136,11 +136,10 @@ def test_windows_show_another_place_where_targets_moved(monkeypatch: pytest.Monk
     of_targets = solve_survey(survey, matched).remarks
     assert of_kind(of_targets, "points_moved") == tuple(moved) and of_kind(of_targets, "two_places")
     of_texture = solve_survey(survey, textured(network, truth)).remarks
-    found = of_kind(of_texture, "windows_elsewhere")
-    assert [one.names("points") for one in found] == [("7",), ("17",)]
-    assert [one.severity for one in found] == ["warning", "warning"] and not of_kind(
-        of_texture, "points_moved"
-    )
+    (found,) = of_kind(of_texture, "windows_elsewhere")
+    assert found.names("points") == ("7", "17") and found.names("from") == ("image 5", "image 6")
+    assert found.severity == "warning" and found.numbers["distance"].value == 0.2
+    assert not of_kind(of_texture, "points_moved")
     assert not of_kind(of_texture, "two_places")  # nobody can measure a point without a name again
 
 

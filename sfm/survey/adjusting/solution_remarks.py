@@ -97,20 +97,42 @@ def posed_by_rigs(adjustment: Adjustment, needed: IntArray) -> tuple[Remark, ...
 def windows_elsewhere(network: Network, remarks: Sequence[Remark]) -> tuple[Remark, ...]:
     """Return the remarks; windows on texture did not move, but are matched at other positions.
 
-    Named points may be among them, but are not most of them. A single window that is seen at two positions
-    is left out: it has no name that a person could correct.
+    Named points may be among them, but are not most of them. All that are matched elsewhere are one remark,
+    as a person does the same with each. A single window that is seen at two positions is left out: it has no
+    name that a person could correct.
     """
     texture, windows = network.automatic_points, network.windows
 
     def are_windows(names: tuple[str, ...]) -> bool:
         return windows.issuperset(names) and 2 * len(texture.intersection(names)) > len(names)
 
+    elsewhere = [
+        said for said in remarks if said.kind == "points_moved" and are_windows(said.names("points"))
+    ]
+    together: Remark | None = None
+    if elsewhere:
+        roles = dict.fromkeys(role for said in elsewhere for role in said.subjects)
+        numbers = dict.fromkeys(name for said in elsewhere for name in said.numbers)
+        together = replace(
+            elsewhere[0],
+            kind="windows_elsewhere",
+            subjects={
+                role: tuple(dict.fromkeys(name for said in elsewhere for name in said.names(role)))
+                for role in roles
+            },
+            numbers={
+                name: max(
+                    (said.numbers[name] for said in elsewhere if name in said.numbers),
+                    key=lambda quantity: quantity.value,
+                )
+                for name in numbers
+            },
+        )
     return tuple(
-        replace(said, kind="windows_elsewhere")
-        if said.kind == "points_moved" and are_windows(said.names("points"))
-        else said
+        together if together is not None and said is elsewhere[0] else said
         for said in remarks
-        if said.kind != "two_places" or said.names("point")[0] not in texture
+        if not any(said is other for other in elsewhere[1:])
+        and (said.kind != "two_places" or said.names("point")[0] not in texture)
     )
 
 
