@@ -231,3 +231,21 @@ def test_a_run_is_kept_once_measured_anew(tmp_path: Path, monkeypatch: pytest.Mo
         (run,) = RunHistory.of_user().read()  # the second read what the first measured
         assert run.work == work and {"targets", "adjustment", "report"} <= run.seconds.keys()
     assert json.loads(RunHistory.of_user().path.read_text("utf-8"))["photographs"] == work.photographs
+
+
+def test_a_run_from_python_is_forecast_without_a_report(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    import sfm
+    from sfm.runtime import progress_bar
+
+    drawn = []
+    draw = progress_bar.DrawnProgress.finished
+    monkeypatch.setattr(
+        progress_bar.DrawnProgress, "finished", lambda bar: drawn.append(bar.countdown) or draw(bar)
+    )
+    path = write_photograph_survey(tmp_path / "survey", "python")
+    sfm.run_survey(path, compare_with="none", progress=True)
+    expected = drawn[0].expected
+    assert {"targets", "orientation", "adjustment"} <= expected.keys() and "report" not in expected
+    assert drawn[0].taken.keys() >= {"targets", "adjustment"}

@@ -23,6 +23,7 @@ from sfm.pipeline import run_survey
 from sfm.products.auditing.audit import Audit, audit_of, stated_of, survey_of_model
 from sfm.products.auditing.prepared import prepared_model
 from sfm.report.pages import html_of, page_of
+from sfm.runtime.forecast import RunHistory
 from sfm.survey.inputs.exterior_table import ObservedExterior
 from sfm.survey.inputs.given_values import ScaleBar
 from sfm.survey.inputs.settings import AdjustSettings, RigSettings
@@ -405,6 +406,29 @@ def test_cameras_that_differ_are_not_called_one() -> None:
     audit = audited(model_of(replace(network, image_points=seen), replace(truth, cameras=cameras)))
     (like,) = audit.like
     assert like.statistic > like.limit and "differ more than one camera would" in f"{like}"
+
+
+def test_an_audit_states_its_time_to_the_end_and_keeps_its_own(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    from sfm.runtime import progress_bar
+
+    stated, finish = [], progress_bar.DrawnProgress.finished
+
+    def finished(drawn: progress_bar.DrawnProgress) -> dict[str, float]:
+        stated.append(drawn.countdown)
+        return finish(drawn)
+
+    monkeypatch.setattr(progress_bar.DrawnProgress, "finished", finished)
+    network, truth = network_of("time to the end")
+    write_content(tmp_path / "model", "colmap", Content(Solution("model", network, truth)))
+    for _ in range(2):
+        assert commands.kolinear("audit", tmp_path / "model", "--out", tmp_path / "out", "--overwrite") == 0
+    first, second = (countdown for k, countdown in enumerate(stated) if k % 2)
+    assert {"adjustment", "report"} <= first.expected.keys() and "comparison" not in first.expected
+    assert second.expected == pytest.approx(first.taken)  # the last run is the most alike
+    work = RunHistory.of_user().read()[-1].work
+    assert work.image_points == len(network.image_points) and work.sources == ("given",)
 
 
 def test_the_command_writes_page_and_report(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
