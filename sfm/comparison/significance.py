@@ -156,7 +156,7 @@ def compare_results(
         a: first result.
         b: second result.
         align: points (all common points that did not move), cameras (projection centres), control (the named
-            points) or none. If not given, points, or none for results that have no points at all.
+            points) or none. If not given, points, or none where a result has no points.
         control: names in a of the points for align = control.
         alpha: probability of reporting a change if there is none.
 
@@ -164,8 +164,8 @@ def compare_results(
         GeometryError: an unknown alignment, too little in common for it, or nothing in common at all.
     """
     if align is None:
-        without = not (a.estimate.determined.any() or b.estimate.determined.any())
-        align = "none" if without else "points"
+        have_points = a.estimate.determined.any() and b.estimate.determined.any()
+        align = "points" if have_points else "none"
     if align not in ALIGNMENTS:
         raise GeometryError(f"comparison: align '{align}', expected one of {', '.join(ALIGNMENTS)}")
     pairing = pair_results(a, b)

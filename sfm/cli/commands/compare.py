@@ -22,8 +22,8 @@ def compare(
         str | None,
         typer.Option(
             "--align",
-            help="Align B to A by points, cameras, control or none.  [default: points; none where neither "
-            "has any]",
+            help="Align B to A by points, cameras, control or none.  [default: points; none where one "
+            "has no points]",
         ),
     ] = None,
     control: Annotated[

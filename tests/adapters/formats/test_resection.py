@@ -3,16 +3,20 @@
 from __future__ import annotations
 
 import json
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 import pytest
 
 from adapters.formats.registry import format_of, read_comparable, read_content, write_content
+from sfm.comparison.significance import compare_results
 from sfm.model.conventions import angles_from_rotation
 from sfm.model.errors import OutputError, SurveyFileError
+from sfm.model.solution import Solution
 from tests.commands import kolinear
 from tests.places import DATASETS
+from tests.synthetic import make_network, seed_of
 
 LAB = DATASETS / "lab2"
 
@@ -117,3 +121,25 @@ def test_a_mirrored_rotation_is_refused(pose: Path) -> None:
     pose.write_text(json.dumps(printed), "utf-8")
     with pytest.raises(SurveyFileError, match="M is no rotation"):
         read_comparable(pose)
+
+
+def test_a_pose_is_tested_against_a_result_with_points(pose: Path, tmp_path: Path) -> None:
+    """In one coordinate system; a result in a free datum has another."""
+    resected = read_comparable(pose)
+    network, truth = make_network(seed_of("pose"), images=4, points=20)
+    covariance = np.repeat(resected.exterior_covariance, 4, axis=0)  # type: ignore[arg-type]
+    position = np.vstack([resected.estimate.position, truth.position[1:]])
+    rotation = np.concatenate([resected.estimate.rotation, truth.rotation[1:]])
+    survey = Solution(
+        "survey",
+        replace(network, images=("9.jpg", *network.images[1:])),
+        replace(truth, position=position, rotation=rotation),
+        exterior_covariance=covariance,
+        datum="control",
+    )
+    compared = compare_results(survey, resected)
+    assert compared.alignment == "none" and compared.images == ("9.jpg",) and not compared.points
+    assert compared.poses is not None and compared.changed is False
+    assert compared.poses.statistic == pytest.approx([0.0])
+    free = compare_results(replace(survey, datum="free"), resected)
+    assert free.poses is None and free.changed is None and free.untested is not None
