@@ -92,13 +92,14 @@ def _typical(work: Work, stages: str, *seconds: float) -> Run:
 _TARGETS = "targets, orientation, matching, adjustment, comparison, report"
 _GIVEN = "orientation, adjustment, comparison, report"
 _TEXTURE = "tie points, orientation, matching, adjustment, comparison, report"
-# Two cores of 2.5 GHz, 2026-11: camcal, stereo-chessboard, the demo, fountain-P11, a sheet of targets on
-# texture, and the image points of stereo10, camcal and fountain-P11. In the first two, whose photographs are
-# real, causes of errors are found and tried.
+# Two cores of 2.5 GHz, 2026-11: camcal, stereo-chessboard, the demo, fountain-P11 in two sizes, a sheet of
+# targets on texture, and the image points of stereo10, camcal and fountain-P11. In the first two, whose
+# photographs are real, causes of errors are found and tried.
 TYPICAL = (
     _typical(Work(("targets",), 21, 3.87), _TARGETS, 3.5, 0.2, 0.4, 7.6, 0.7, 1.6),
     _typical(Work(("targets",), 28, 0.31), _TARGETS, 1.2, 0.1, 0.3, 6.6, 0.4, 1.2),
     _typical(Work(("targets",), 12, 1.92), _TARGETS, 4.3, 0.4, 0.3, 0.3, 0.4, 1.2),
+    _typical(Work(("texture",), 11, 1.57), _TEXTURE, 3.0, 1.3, 16.0, 14.0, 5.0, 9.0),
     _typical(Work(("texture",), 11, 6.29), _TEXTURE, 7.0, 2.0, 12.0, 8.0, 2.0, 6.0),
     _typical(
         Work(("targets", "texture"), 30, 0.31),
