@@ -222,7 +222,14 @@ class Countdown:
         ]
 
     def left(
-        self, stage: str, elapsed: float, done: int = 0, parts: int = 0, slower: float | None = None
+        self,
+        stage: str,
+        elapsed: float,
+        done: int = 0,
+        parts: int = 0,
+        *,
+        slower: float | None = None,
+        at_least: float = 0.0,
     ) -> float | None:
         """Return the time left of all stages, s; None where nothing is expected of them.
 
@@ -232,6 +239,7 @@ class Countdown:
             done: number of its parts that are finished; 0 if it counts only a part of its work.
             parts: number of all its parts.
             slower: how much longer stages take than expected; None for those of this survey.
+            at_least: time left of the stage's present work, s.
         """
         if not self.expected:
             return None
@@ -240,7 +248,7 @@ class Countdown:
             slower = slowness(self.compared(stage, counted))
         of_stage = counted if counted is not None else slower * self.expected.get(stage, 0.0)
         later = sum(s for name, s in self.expected.items() if name != stage and name not in self.taken)
-        return max(0.0, of_stage - elapsed) + slower * later
+        return max(at_least, of_stage - elapsed) + slower * later
 
 
 @dataclass
@@ -337,7 +345,7 @@ class BatchCountdown:
             present.append((survey, elapsed))
         slower = slowness(compared)
         times = [
-            survey.countdown.left(survey.stage, elapsed, survey.done, survey.parts, slower)
+            survey.countdown.left(survey.stage, elapsed, survey.done, survey.parts, slower=slower)
             for survey, elapsed in present
         ]
         known = [seconds for seconds in times if seconds is not None]

@@ -112,8 +112,12 @@ class _Times(ProgressColumn):
             text.append(f", about {clock_time(left)} left", "progress.remaining")
         if task.stop_time is None:
             parts = task.fields["parts"]
-            done = int(task.completed) if parts and task.total == parts else 0
-            of_all = self._countdown.left(task.description, task.elapsed or 0.0, done, parts or 0)
+            counts_all = bool(parts) and task.total == parts
+            done = int(task.completed) if counts_all else 0
+            of_work = 0.0 if counts_all else left or 0.0
+            of_all = self._countdown.left(
+                task.description, task.elapsed or 0.0, done, parts or 0, at_least=of_work
+            )
             if of_all is not None:
                 text.append(f", {clock_time(of_all)} to the end", "progress.remaining")
         return text

@@ -64,6 +64,12 @@ def test_what_is_left_follows_the_stages_that_are_finished() -> None:
     assert Countdown().left("targets", 1.0) is None
 
 
+def test_the_end_is_not_before_that_of_the_present_work() -> None:
+    countdown = Countdown({"adjustment": 4.0, "report": 6.0})
+    assert countdown.left("adjustment", 9.0, at_least=7.0) == pytest.approx(7.0 + 6.0)
+    assert countdown.left("adjustment", 1.0, at_least=2.0) == pytest.approx(3.0 + 6.0)
+
+
 def test_stages_that_read_an_earlier_measurement_say_nothing_of_the_others() -> None:
     countdown = Countdown({"targets": 10.0, "orientation": 4.0, "adjustment": 6.0})
     countdown.finish("targets", 0.1)
