@@ -71,11 +71,28 @@ def remarks_of_cause(
 
 
 def _remarks(comparison: ResultComparison) -> Iterator[Remark]:
+    tested = int(np.isfinite(comparison.statistic).sum())
+    counted_points = {"tested": tested, "points": len(comparison.points)}
+    yield from _remarks_on_differences(comparison, tested)
+    if comparison.untested is not None:
+        # untestable differences of which a cause is known were tested with it
+        if comparison.cause is None or comparison.untested.kind != "untestable":
+            yield comparison.untested
+    elif comparison.approximate:
+        yield remark("differences_tested", how="singly", **counted_points)
+    elif tested <= MAX_POINTS < len(comparison.points):
+        yield remark("differences_tested", how="jointly", **counted_points)
+    too_lean = any(weakness.camera is not None for weakness in comparison.weaker)
+    if comparison.changed and comparison.independent and not too_lean:
+        yield from _remarks_on_cameras(comparison)
+    yield from _remarks_on_weaknesses(comparison)
+
+
+def _remarks_on_differences(comparison: ResultComparison, tested: int) -> Iterator[Remark]:
+    """Yield remarks on what differs: as a whole, poses of photographs, or so many tested points singly."""
     first, second = comparison.names
     longest = np.linalg.norm(comparison.point_difference, axis=1)
     unit = comparison.unit or "object units"
-    tested = int(np.isfinite(comparison.statistic).sum())
-    counted_points = {"tested": tested, "points": len(comparison.points)}
     if comparison.cause is not None:
         yield from remarks_of_cause(
             comparison.cause, first, second, len(comparison.points), (float(longest.max()), unit)
@@ -103,17 +120,10 @@ def _remarks(comparison: ResultComparison) -> Iterator[Remark]:
         else:
             statistic, critical = comparison.global_statistic, comparison.global_critical
             yield remark("points_differ", statistic=statistic, critical=critical)
-    if comparison.untested is not None:
-        # untestable differences of which a cause is known were tested with it
-        if comparison.cause is None or comparison.untested.kind != "untestable":
-            yield comparison.untested
-    elif comparison.approximate:
-        yield remark("differences_tested", how="singly", **counted_points)
-    elif tested <= MAX_POINTS < len(comparison.points):
-        yield remark("differences_tested", how="jointly", **counted_points)
-    too_lean = any(weakness.camera is not None for weakness in comparison.weaker)
-    if comparison.changed and comparison.independent and not too_lean:
-        yield from _remarks_on_cameras(comparison)
+
+
+def _remarks_on_weaknesses(comparison: ResultComparison) -> Iterator[Remark]:
+    """Yield remarks on image points and lens models that make one of the results the weaker."""
     for weakness in comparison.weaker:
         between = {"weaker": weakness.name, "of": weakness.of}
         if weakness.sigma_px is not None:

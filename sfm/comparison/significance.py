@@ -46,6 +46,7 @@ from sfm.model.solution import Solution
 
 FREE_DATUMS = ("free", "")  # in which the covariance of single points gives about the same test
 ALIGNMENTS = ("points", "cameras", "control", "none")
+NO_COMMON_DATUM = "without an alignment, only results in the datum of control share a frame"
 SAME_PX = 1e-3  # closer image points are one measurement
 SAME_SHARE = 0.5  # of a's image points; if b has more of them, the results are not independent
 
@@ -163,11 +164,7 @@ def compare_results(
     Raises:
         GeometryError: an unknown alignment, too little in common for it, or nothing in common at all.
     """
-    if align is None:
-        have_points = a.estimate.determined.any() and b.estimate.determined.any()
-        align = "points" if have_points else "none"
-    if align not in ALIGNMENTS:
-        raise GeometryError(f"comparison: align '{align}', expected one of {', '.join(ALIGNMENTS)}")
+    align = _alignment(a, b, align)
     pairing = pair_results(a, b)
     pa, pb = pairing.points.T
     ia, ib = pairing.images.T
@@ -194,13 +191,12 @@ def compare_results(
     if align == "points" and test.untested is None and not stable.all():
         transform = fit_similarity(b.estimate.points[pb[stable]], a.estimate.points[pa[stable]], scale=scale)
         moved = transform.apply_estimate(b.estimate)
-    tested = test.untested is None
     points, free, _ = pairs
     cause = None
     if align != "none" and any(has_sigma(result) for result in (a, b)):
-        agrees = tested and test.agrees
+        agrees = test.untested is None and test.agrees
         cause = find_cause(points, reference=chosen[free], changed=not agrees)
-    nothing = np.full(len(pa), np.nan)
+    test = replace(test, stable=stable).without_untested
     known = has_sigma if poses is None else has_pose_sigma
     return ResultComparison(
         names=(a.name, b.name),
@@ -216,12 +212,12 @@ def compare_results(
         point_sigma=test.sigma,
         untested=test.untested,
         approximate=test.approximate,
-        statistic=test.statistic if tested else nothing,
-        critical=test.critical if tested else np.nan,
-        significant=test.significant & tested,
-        global_statistic=test.global_statistic if tested else np.nan,
-        global_critical=test.global_critical if tested else np.nan,
-        stable=stable | (not tested),
+        statistic=test.statistic,
+        critical=test.critical,
+        significant=test.significant,
+        global_statistic=test.global_statistic,
+        global_critical=test.global_critical,
+        stable=test.stable,
         majority=test.majority,
         cause=cause,
         images=tuple(a.network.images[i] for i in ia),
@@ -231,6 +227,16 @@ def compare_results(
         interior=_interior(a, b, ia, ib),
         weaker=weaker_solutions(a, b, pairing),
     )
+
+
+def _alignment(a: Solution, b: Solution, align: str | None) -> str:
+    """Return the alignment that was asked for, or the usual one."""
+    if align is None:
+        have_points = a.estimate.determined.any() and b.estimate.determined.any()
+        return "points" if have_points else "none"
+    if align not in ALIGNMENTS:
+        raise GeometryError(f"comparison: align '{align}', expected one of {', '.join(ALIGNMENTS)}")
+    return align
 
 
 def _alignment_points(names: tuple[str, ...], align: str, control: tuple[str, ...]) -> BoolArray:
@@ -344,6 +350,23 @@ class PointTest:
     majority: bool = True
 
     @property
+    def without_untested(self) -> PointTest:
+        """The test without figures that mean nothing, if there is a reason not to test."""
+        if self.untested is None:
+            return self
+        nothing = np.full(len(self.statistic), np.nan)
+        every = np.ones(len(self.statistic), dtype=bool)
+        return replace(
+            self,
+            statistic=nothing,
+            critical=np.nan,
+            significant=~every,
+            global_statistic=np.nan,
+            global_critical=np.nan,
+            stable=every,
+        )
+
+    @property
     def agrees(self) -> bool:
         """Whether no test shows that the points differ."""
         return not (
@@ -393,7 +416,7 @@ def judge_points(
     points, free, together = pairs
     if all(result.covariance is not None for result in known):
         if align == "none" and not all(result.datum == "control" for result in known):
-            return without(remark("no_common_datum"))
+            return without(remark("untestable", reason=NO_COMMON_DATUM))
         d, Q = points.differences(transform)
         try:
             test = congruency(

@@ -19,12 +19,10 @@ from sfm.comparison.camera_conversion import convert_camera
 from sfm.comparison.camera_readjustment import adjusted_with
 from sfm.comparison.pairing import Pairing
 from sfm.comparison.solutions import reprojection
-from sfm.model.camera import Camera
 from sfm.model.conventions import MAD_TO_SIGMA
 from sfm.model.distributions import LEVEL, MIN_LEAD, f_sf
 from sfm.model.errors import GeometryError, SurveyFileError
 from sfm.model.likelihood import price_of
-from sfm.model.network import Network
 from sfm.model.solution import Solution
 
 MAD_EFFICIENCY = 0.37  # of the median of absolute deviations against the standard deviation
@@ -86,15 +84,11 @@ def _weakness(weaker: Solution, other: Solution, cameras: list[tuple[int, int]])
 def _sigma_px(solution: Solution) -> tuple[float, int]:
     """Return the robust standard deviation of an image coordinate, px, and its degrees of freedom."""
     v = reprojection(solution.network, solution.estimate)
-    freedom = max(v.size - _unknowns(solution.network), 1)
+    seen = solution.network.image_points
+    unknowns = 6 * len(np.unique(seen.image)) + 3 * len(np.unique(seen.point)) - 7
+    freedom = max(v.size - unknowns, 1)
     spread = MAD_TO_SIGMA * float(np.median(np.abs(v))) if v.size else np.nan
     return spread / float(np.sqrt(min(1.0, freedom / max(v.size, 1)))), freedom
-
-
-def _unknowns(network: Network) -> int:
-    """Return the number of exterior orientations and coordinates that image points determine."""
-    seen = network.image_points
-    return 6 * len(np.unique(seen.image)) + 3 * len(np.unique(seen.point)) - 7
 
 
 def _leaner_lenses(
@@ -107,9 +101,14 @@ def _leaner_lenses(
     before = None
     for q, p in {q: p for p, q in reversed(cameras)}.items():  # each camera of the other one once
         ours, theirs = other.estimate.cameras[q], weaker.estimate.cameras[p]
-        leaner = _with_model_of(theirs, ours)
-        saved = 0 if leaner is None else int(ours.free.sum()) - int(leaner.free.sum())
-        if leaner is None or saved <= 0:
+        used = zip(theirs.names, theirs.parameters, strict=True)
+        try:  # with only the terms that are used there
+            held = tuple(name for name, value in used if value == 0)
+            leaner = convert_camera(ours, theirs.model, held=held).camera
+        except (GeometryError, SurveyFileError):
+            continue
+        saved = int(ours.free.sum()) - int(leaner.free.sum())
+        if saved <= 0:
             continue
         before = before or adjusted_with(other, {})
         after = adjusted_with(other, {ours.name: leaner})
@@ -119,12 +118,3 @@ def _leaner_lenses(
         seen = int((other.network.camera[other.network.image_points.image] == q).sum())
         if loss > price_of(saved, seen) + MIN_LEAD:
             yield ours.name, theirs.model, _sigma_px(after.solution)[0], _sigma_px(before.solution)[0]
-
-
-def _with_model_of(theirs: Camera, ours: Camera) -> Camera | None:
-    """Return a camera in the model of another one, with only the terms that are used there."""
-    unused = tuple(name for name, value in zip(theirs.names, theirs.parameters, strict=True) if value == 0)
-    try:
-        return convert_camera(ours, theirs.model, held=unused).camera
-    except (GeometryError, SurveyFileError):
-        return None

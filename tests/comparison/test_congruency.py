@@ -17,7 +17,7 @@ from sfm.adjustment.datum import Datum
 from sfm.adjustment.solve import adjust
 from sfm.comparison.comparison_remarks import verdict_of_comparison
 from sfm.comparison.congruency import congruency, motions
-from sfm.comparison.significance import ResultComparison, compare_results
+from sfm.comparison.significance import NO_COMMON_DATUM, ResultComparison, compare_results
 from sfm.comparison.solutions import compare_baseline, reprojection
 from sfm.comparison.stable_points import tests_in_datum as single_tests_in_datum
 from sfm.model.conventions import FloatArray, rotation_from_vector
@@ -169,7 +169,9 @@ def test_units_are_carried_over() -> None:
 
 def test_without_a_common_datum_or_correlations_no_verdict_is_given() -> None:
     first, second = epoch(2, "minimal"), epoch(3, "minimal")
-    assert compare_results(first, second, align="none").untested == remark("no_common_datum")
+    assert compare_results(first, second, align="none").untested == remark(
+        "untestable", reason=NO_COMMON_DATUM
+    )
     found = compare_results(replace(first, covariance=None), replace(second, covariance=None))
     assert found.changed is None and kinds_of(remarks(found)) == ("no_covariance",)
     approximate = compare_results(*(replace(epoch(k, "free"), covariance=None) for k in (2, 3)))

@@ -163,18 +163,11 @@ ROWS = (
         "Compare results that this version computed.",
     ),
     Kind(
-        "no_common_datum",
-        "warning",
-        "Not tested: without an alignment, only results in the datum of control share a frame.",
-        "a free or minimal datum, and --align none",
-        "Align them by points or control.",
-    ),
-    Kind(
         "untestable",
         "warning",
         "Not tested: {reason}.",
         "names, image points or positions differ, too few points are common, or they determine no datum",
-        "Make the names agree, or compare results with more points in common.",
+        "Make the names agree, align by points or control, or compare results with more points in common.",
     ),
     Kind(
         "displaced",
