@@ -449,3 +449,19 @@ def test_ctrl_c_while_modules_are_imported_is_one_line(tmp_path: Path, seconds: 
     if running.returncode != 2:  # on a fast computer it has found by now that there are no surveys
         assert running.returncode == 130, errors
         assert errors == f"{process.INTERRUPTED_TEXT}\n"
+
+
+@pytest.mark.parametrize(
+    "asked",
+    [
+        {"_KOLINEAR_COMPLETE": "complete_bash", "COMP_WORDS": "kolinear ge", "COMP_CWORD": "1"},
+        {"_KOLINEAR_COMPLETE": "complete_zsh", "_TYPER_COMPLETE_ARGS": "kolinear ge"},
+    ],
+)
+def test_shells_complete_commands(asked: dict[str, str]) -> None:
+    """What the scripts of `--install-completion` ask the program at the tab key."""
+    asks = "import sys; sys.argv[0] = 'kolinear'; from sfm.cli import main; main()"
+    told = subprocess.run(
+        [sys.executable, "-c", asks], env=os.environ | asked, capture_output=True, text=True, timeout=60
+    )
+    assert "georeference" in told.stdout and "refine" not in told.stdout
