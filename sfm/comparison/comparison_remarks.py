@@ -85,7 +85,14 @@ def _remarks(comparison: ResultComparison) -> Iterator[Remark]:
     too_lean = any(weakness.camera is not None for weakness in comparison.weaker)
     if comparison.changed and comparison.independent and not too_lean:
         yield from _remarks_on_cameras(comparison)
-    yield from _remarks_on_weaknesses(comparison)
+    for weakness in comparison.weaker:
+        between = {"weaker": weakness.name, "of": weakness.of}
+        if weakness.sigma_px is not None:
+            sigmas = {"theirs": (weakness.sigma_px, "px"), "ours": (weakness.of_sigma_px, "px")}
+            yield remark("weaker_solution", **sigmas, **between)
+        if weakness.camera is not None:
+            fits = {"fits": (weakness.with_model_px, "px"), "own": (weakness.own_px, "px")}
+            yield remark("weaker_solution", model=weakness.model, camera=weakness.camera, **fits, **between)
 
 
 def _remarks_on_differences(comparison: ResultComparison, tested: int) -> Iterator[Remark]:
@@ -120,18 +127,6 @@ def _remarks_on_differences(comparison: ResultComparison, tested: int) -> Iterat
         else:
             statistic, critical = comparison.global_statistic, comparison.global_critical
             yield remark("points_differ", statistic=statistic, critical=critical)
-
-
-def _remarks_on_weaknesses(comparison: ResultComparison) -> Iterator[Remark]:
-    """Yield remarks on image points and lens models that make one of the results the weaker."""
-    for weakness in comparison.weaker:
-        between = {"weaker": weakness.name, "of": weakness.of}
-        if weakness.sigma_px is not None:
-            sigmas = {"theirs": (weakness.sigma_px, "px"), "ours": (weakness.of_sigma_px, "px")}
-            yield remark("weaker_solution", **sigmas, **between)
-        if weakness.camera is not None:
-            fits = {"fits": (weakness.with_model_px, "px"), "own": (weakness.own_px, "px")}
-            yield remark("weaker_solution", model=weakness.model, camera=weakness.camera, **fits, **between)
 
 
 def _remarks_on_cameras(comparison: ResultComparison) -> Iterator[Remark]:

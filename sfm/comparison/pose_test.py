@@ -10,7 +10,6 @@ Source: Luhmann et al. (2020), Close-Range Photogrammetry and 3D Imaging, sec. 2
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -72,8 +71,16 @@ def compare_poses(a: Solution, b: Solution, images: IntArray, alpha: float) -> P
     ]
     difference = elements[1] - elements[0]
     difference[:, 3:] = (difference[:, 3:] + np.pi) % (2 * np.pi) - np.pi
-    of_known = [images[:, k] for k, result in enumerate((a, b)) if has_pose_sigma(result)]
-    Q = _sum_of_covariances(known, of_known)
+    blocks = np.array(
+        [
+            result.exterior_covariance[images[:, k]]
+            for k, result in enumerate((a, b))
+            if result.exterior_covariance is not None and has_pose_sigma(result)
+        ]
+    )
+    finite = np.isfinite(blocks).all(axis=(2, 3), keepdims=True)  # of one result it may be unknown
+    total = np.where(finite, blocks, 0.0).sum(axis=0)
+    Q = np.where(finite.any(axis=0), total, np.nan)
     sigma = np.sqrt(np.einsum("kii->ki", Q))  # NaN where it is unknown
     # of correlations, as the elements have several units
     correlation = Q / np.einsum("ki,kj->kij", sigma, sigma)
@@ -91,17 +98,3 @@ def compare_poses(a: Solution, b: Solution, images: IntArray, alpha: float) -> P
     redundancy = min(redundancies) if redundancies else None  # each result has a sigma0 of its own
     critical = critical_value(alpha / int(testable.sum()), ELEMENTS, redundancy)
     return PoseTest(difference, sigma, statistic / ELEMENTS, critical, redundancy)
-
-
-def _sum_of_covariances(known: Sequence[Solution], rows: Sequence[IntArray]) -> FloatArray:
-    """Return the sum of the covariances of each photograph, of which one may be unknown, (m, 6, 6)."""
-    blocks = np.array(
-        [
-            result.exterior_covariance[of_result]
-            for result, of_result in zip(known, rows, strict=True)
-            if result.exterior_covariance is not None
-        ]
-    )
-    finite = np.isfinite(blocks).all(axis=(2, 3), keepdims=True)
-    total = np.where(finite, blocks, 0.0).sum(axis=0)
-    return np.where(finite.any(axis=0), total, np.nan)

@@ -61,24 +61,18 @@ def weaker_solutions(a: Solution, b: Solution, pairing: Pairing) -> tuple[Weakne
     }  # of the common photographs
     if any(a.estimate.cameras[p].size_px != b.estimate.cameras[q].size_px for p, q in cameras):
         return ()  # photographs of another size have other pixels
-    return tuple(
-        weakness
-        for weaker, other, pairs in ((b, a, {(q, p) for p, q in cameras}), (a, b, cameras))
-        if (weakness := _weakness(weaker, other, sorted(pairs))) is not None
-    )
-
-
-def _weakness(weaker: Solution, other: Solution, cameras: list[tuple[int, int]]) -> Weakness | None:
-    """Return why a solution is weaker than another one; None if it is not, or not beyond chance."""
-    theirs, freedom = _sigma_px(weaker)
-    ours, of_freedom = _sigma_px(other)
-    lens = next(_leaner_lenses(weaker, other, cameras), None)
-    misfit = 1.0 if lens is None else lens[2] / lens[3]  # the lens alone makes residuals so much larger
-    freedoms = (MAD_EFFICIENCY * freedom, MAD_EFFICIENCY * of_freedom)
-    coarse = ours > 0 and float(f_sf((theirs / (misfit * ours)) ** 2, *freedoms)) < LEVEL
-    if lens is None and not coarse:
-        return None
-    return Weakness(weaker.name, other.name, theirs if coarse else None, ours, *(lens or ()))
+    weaknesses = []
+    for weaker, other, pairs in ((b, a, {(q, p) for p, q in cameras}), (a, b, cameras)):
+        theirs, freedom = _sigma_px(weaker)
+        ours, of_freedom = _sigma_px(other)
+        lens = next(_leaner_lenses(weaker, other, sorted(pairs)), None)
+        misfit = 1.0 if lens is None else lens[2] / lens[3]  # the lens alone makes residuals so much larger
+        freedoms = (MAD_EFFICIENCY * freedom, MAD_EFFICIENCY * of_freedom)
+        coarse = ours > 0 and float(f_sf((theirs / (misfit * ours)) ** 2, *freedoms)) < LEVEL
+        if coarse or lens is not None:
+            sigma_px = theirs if coarse else None
+            weaknesses.append(Weakness(weaker.name, other.name, sigma_px, ours, *(lens or ())))
+    return tuple(weaknesses)
 
 
 def _sigma_px(solution: Solution) -> tuple[float, int]:

@@ -77,7 +77,11 @@ def run_survey(
             from sfm.runtime.progress_bar import drawn_progress
 
             watching = drawn = stack.enter_context(drawn_progress())
-            drawn.countdown.expected = _expected_of_stages(survey, images_dir)
+            reads = reads_photographs(survey)
+            files = find_photographs(survey, images_dir=images_dir) if reads else NO_PHOTOGRAPHS
+            expected = expected_seconds(work_of(survey, files), RunHistory.of_user().read())
+            expected.pop("report", None)
+            drawn.countdown.expected = expected
         elif progress is not False:
             watching = progress
         return run_stages(
@@ -88,15 +92,6 @@ def run_survey(
             store=None if store is None else MeasuredStore(Path(store)),
             progress=watching,
         )
-
-
-def _expected_of_stages(survey: Survey, images_dir: Path | None) -> dict[str, float]:
-    """Return the expected time of each stage of a survey without its report, s."""
-    reads = reads_photographs(survey)
-    files = find_photographs(survey, images_dir=images_dir) if reads else NO_PHOTOGRAPHS
-    expected = expected_seconds(work_of(survey, files), RunHistory.of_user().read())
-    expected.pop("report", None)
-    return expected
 
 
 @checked_arguments()
