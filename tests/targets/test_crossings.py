@@ -163,3 +163,22 @@ def test_a_cut_board_is_measured() -> None:
     found = find_targets(picture, codes=PlateFamily("checkerboard", 7, 8))
     assert 20 < len(found) < 56
     assert np.abs(found.xy - truth.reshape(-1, 2)[found.code]).max() < 0.3
+
+
+@pytest.mark.parametrize("flat", [0.7, 0.5, 0.4])
+def test_a_board_whose_diagonals_are_shorter_than_its_rows_is_named(flat: float) -> None:
+    """Compressed along the diagonal of its squares, as by a tilt of up to 66 degrees."""
+    squares = np.pad(np.add.outer(np.arange(7), np.arange(10)) % 2, 1, constant_values=1)
+    board = np.where(squares, 220, 30).astype(np.uint8).repeat(60, 0).repeat(60, 1)
+    turn = np.array([[1.0, -1.0], [1.0, 1.0]]) / np.sqrt(2)
+    A = np.diag([1.0, flat]) @ turn
+    middle = (np.array(board.shape[::-1]) - 1) / 2
+    move = np.column_stack([A, np.array([400.0, 300.0]) - A @ middle])
+    picture = cv2.warpAffine(
+        cv2.GaussianBlur(board, (0, 0), 1.5), move, (800, 600), flags=cv2.INTER_AREA, borderValue=220.0
+    )
+    xy, code = name_cut_board(np.asarray(picture), 6, 9)
+    row, column = np.mgrid[1:7, 1:10]
+    true = 60 * np.stack([column + 1, row + 1], axis=2).reshape(-1, 2) - 0.5
+    assert sorted(code) == list(range(54))
+    assert np.hypot(*(xy - (true @ A.T + move[:, 2])[code]).T).max() < 0.5

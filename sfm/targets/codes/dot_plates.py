@@ -12,7 +12,7 @@ from __future__ import annotations
 import heapq
 import itertools
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -185,6 +185,16 @@ class Lattice:
     def box(self) -> int:
         """Number of positions in the bounding box of rows and columns."""
         return int((np.ptp(self.place, axis=0) + 1).prod())
+
+    def by_shortest_box(self) -> Lattice:
+        """Return the lattice with diagonals as rows or columns where these make its box smaller.
+
+        A board that is tilted by more than 45 degrees has diagonals that are shorter than its rows.
+        """
+        sheared = (np.array([[1, k], [0, 1]]) for k in (1, -1))
+        others = [replace(self, place=self.place @ S) for shear in sheared for S in (shear, shear.T)]
+        best = min(others, key=lambda lattice: lattice.box)
+        return best.by_shortest_box() if best.box < self.box else self
 
 
 def find_lattice(xy: FloatArray, is_dot: BoolArray) -> Lattice | None:

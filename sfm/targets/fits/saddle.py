@@ -62,12 +62,12 @@ def measure_saddles(image: AnyArray, start: FloatArray, half_px: FloatArray, *, 
     out = Saddles(*empty, np.full(k, np.nan), np.full(k, np.nan))
     if not k:
         return out
-    smooth = cv2.GaussianBlur(image.astype(np.float32), (0, 0), SMOOTHING_PX)
     half = np.clip(np.floor(half_px), MIN_HALF_PX, MAX_HALF_PX).astype(np.int64)
+    smooth, gx, gy = _filtered(image, start, half)
     _measure_all(
-        np.asarray(smooth),
-        np.asarray(cv2.Sobel(smooth, cv2.CV_32F, 1, 0, ksize=3, scale=1 / 8)),
-        np.asarray(cv2.Sobel(smooth, cv2.CV_32F, 0, 1, ksize=3, scale=1 / 8)),
+        smooth,
+        gx,
+        gy,
         start.astype(float),
         half,
         noise,
@@ -77,6 +77,38 @@ def measure_saddles(image: AnyArray, start: FloatArray, half_px: FloatArray, *, 
         out.blur,
     )
     return out
+
+
+def _filtered(image: AnyArray, start: FloatArray, half: IntArray) -> tuple[AnyArray, AnyArray, AnyArray]:
+    """Return smoothed intensities and their derivatives by x and y, (H, W) each, around crossings.
+
+    They are 0 elsewhere: windows of a board are a fifth of its photograph, and filters take longer than
+    the measurement. Windows of more pixels than the photograph are filtered together.
+
+    Args:
+        image: intensities, (H, W).
+        start: approximate positions of the crossings, px, (k, 2).
+        half: half sides of their windows, px, (k,).
+    """
+    size = np.array(image.shape)
+    reach = np.ceil((1 + MAX_OFF_FRACTION) * half).astype(np.int64) + REACH_PX + 2
+    place = np.rint(start[:, ::-1]).astype(np.int64)
+    low = np.clip(place - reach[:, None], 0, size)
+    high = np.clip(place + reach[:, None] + 1, 0, size)
+    if (high - low).prod(axis=1).sum() > image.size:
+        low, high = np.zeros((1, 2), dtype=np.int64), size[None]
+    smooth, gx, gy = (np.zeros(image.shape, dtype=np.float32) for _ in range(3))
+    for (top, left), (bottom, right) in zip(low.tolist(), high.tolist(), strict=True):
+        if top >= bottom or left >= right:
+            continue
+        above, before = max(top - REACH_PX, 0), max(left - REACH_PX, 0)
+        window = image[above : bottom + REACH_PX, before : right + REACH_PX].astype(np.float32)
+        part = np.asarray(cv2.GaussianBlur(window, (0, 0), SMOOTHING_PX))
+        own = slice(top - above, bottom - above), slice(left - before, right - before)
+        smooth[top:bottom, left:right] = part[own]
+        gx[top:bottom, left:right] = cv2.Sobel(part, cv2.CV_32F, 1, 0, ksize=3, scale=1 / 8)[own]
+        gy[top:bottom, left:right] = cv2.Sobel(part, cv2.CV_32F, 0, 1, ksize=3, scale=1 / 8)[own]
+    return smooth, gx, gy
 
 
 # Weights of a derivative's smoothing along and across it, 2 REACH_PX + 1 each.
