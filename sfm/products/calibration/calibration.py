@@ -22,7 +22,7 @@ from sfm.model.camera import Camera, angle_between, camera_families, outermost_r
 from sfm.model.conventions import BoolArray, FloatArray, IntArray
 from sfm.model.distributions import level_of_single
 from sfm.model.errors import GeometryError
-from sfm.model.remarks.remark import Remark, kinds_of, remark
+from sfm.model.remarks.remark import Remark, kinds_of, of_kind, remark
 from sfm.model.similarity import fit_similarity
 from sfm.products.calibration.crossvalidation import CrossValidation, cross_validate
 from sfm.products.calibration.models import Alternative, compare_models
@@ -34,6 +34,8 @@ from sfm.products.calibration.splined import SplinedCalibration, spline_camera
 # Sigma of projection over the smallest one, beyond which the camera counts as extrapolated: mrcal's picture
 # of a region, and three times the error is nine times the weight of a point.
 KNOWN_FACTOR = 3.0
+# Remarks on a camera that was held although the photographs contradict it or do not determine it.
+NOT_ADJUSTED = ("calibration_failed", "interior_held", "held_parameter")
 MIN_SHAPE = 4  # points of the object; three have the shape of any others but for their distances
 
 
@@ -171,7 +173,8 @@ def calibrate(result: SurveyResult, distances: Sequence[float] = ()) -> Calibrat
             is always one of them.
 
     Raises:
-        GeometryError: a distance that is not positive, or no camera was adjusted.
+        GeometryError: a distance that is not positive, or no camera was adjusted and no remark of the result
+            says why, as those of NOT_ADJUSTED do.
 
     Source: `sfm.products.calibration.projection` and the other modules of this room.
     """
@@ -186,16 +189,16 @@ def calibrate(result: SurveyResult, distances: Sequence[float] = ()) -> Calibrat
     # of cameras with common parameters, the first that has image points
     first = measured[np.unique(family[measured], return_index=True)[1]]
     cameras = tuple(_camera_of(adjustment, k, demanded) for k in first.tolist() if lenses[k].free.any())
-    if not cameras:
+    if not cameras and not of_kind(result.remarks, *NOT_ADJUSTED):
         raise GeometryError(
             f"survey {result.survey}: no camera was adjusted, so that nothing is calibrated; free its "
             "parameters, or give more photographs"
         )
     finite = sorted({d for d in distances if np.isfinite(d)})
-    if not finite:
+    if not finite and cameras:
         finite = [float(np.median([camera.usual for camera in cameras]))]
     validation = cross_validate(adjustment)
-    level = level_of_single(adjustment.levels.family, max(len(validation.differences), len(cameras)))
+    level = level_of_single(adjustment.levels.family, max(len(validation.differences), len(cameras), 1))
     cameras = tuple(_with_splined(adjustment, camera, level) for camera in cameras)
     remarks = (*result.remarks, *_remarks(result, cameras, validation, level))
     return Calibration(

@@ -15,9 +15,12 @@ from scipy.spatial import ConvexHull
 from sfm.model.conventions import finer_unit
 from sfm.model.display import counted, listed
 from sfm.model.distortion.models import Role
+from sfm.model.distributions import normal_sf
+from sfm.model.remarks.remark import of_kind
 from sfm.model.remarks.verdict import Level, Verdict, judge
 from sfm.products.calibration.calibration import (
     KNOWN_FACTOR,
+    NOT_ADJUSTED,
     Calibration,
     CameraCalibration,
     ObjectShape,
@@ -141,6 +144,10 @@ def _focal(camera: CameraCalibration) -> Iterator[tuple[str, float, float]]:
 
 def _trust(calibration: Calibration) -> Iterator[Part]:
     unit = calibration.result.length_unit
+    if not calibration.cameras:
+        for said in of_kind(calibration.remarks, *NOT_ADJUSTED):
+            yield Statement(said.text, "bad")
+        return
     a = calibration.result.adjustment
     for camera in calibration.cameras:
         width, height = camera.camera.size_px
@@ -205,6 +212,8 @@ def _where(calibration: Calibration) -> Iterator[Part]:
             yield Statement(f"Camera {camera.name} is not determined: it is known nowhere.", "bad")
             continue
         yield _map_plot(calibration, camera, number)
+    if not calibration.cameras:
+        yield Statement("No camera is known anywhere, as none is calibrated.", "bad")
     determined = [camera for camera in calibration.cameras if np.isfinite(camera.known.covariance).all()]
     if determined:
         yield _curve_plot(calibration, determined)
@@ -282,6 +291,16 @@ def _format(panel: Axes, camera: CameraCalibration, title: str) -> None:
 
 
 def _wrong(calibration: Calibration, folder: str) -> Iterator[Part]:
+    if calibration.cameras:
+        yield from _wrong_with_cameras(calibration, folder)
+    if calibration.shape is not None:
+        yield Heading("Board" if calibration.shape.flat else "Object")
+        yield from _shape_parts(calibration, calibration.shape)
+    elif not calibration.cameras:
+        yield Paragraph("Nothing can be tested without a calibrated camera.")
+
+
+def _wrong_with_cameras(calibration: Calibration, folder: str) -> Iterator[Part]:
     level = calibration.level
     yield Heading("Model")
     for camera in calibration.cameras:
@@ -305,9 +324,6 @@ def _wrong(calibration: Calibration, folder: str) -> Iterator[Part]:
             )
     yield Heading("Halves of the photographs")
     yield from _halves_parts(calibration)
-    if calibration.shape is not None:
-        yield Heading("Board" if calibration.shape.flat else "Object")
-        yield from _shape_parts(calibration, calibration.shape)
 
 
 def _p(probability: float) -> str:
@@ -438,6 +454,8 @@ def _shape_parts(calibration: Calibration, shape: ObjectShape) -> Iterator[Part]
     factor, fine = finer_unit_of(unit, shape.difference)
     rms = float(np.sqrt((shape.difference**2).sum(axis=1).mean()))
     sigma = float(np.sqrt((shape.sigma**2).sum(axis=1).mean()))
+    variance = np.diagonal(calibration.result.network.control.complete.covariance, axis1=1, axis2=2)
+    held = not (variance > 0).any()
     rows = [
         ("points", str(len(shape.points))),
         (
@@ -447,17 +465,28 @@ def _shape_parts(calibration: Calibration, shape: ObjectShape) -> Iterator[Part]
     ]
     if shape.flat:
         off, off_sigma = shape.off_plane
+        sigmas = np.abs(off) / np.maximum(off_sigma, 1e-300)
         worst = int(np.abs(off).argmax())
+        far = f"{significant(abs(off[worst]) * factor)} {fine}"
+        if 2 * len(off) * float(normal_sf(sigmas.max())) < calibration.level:
+            remedy = (
+                "They were held in it, and the camera is wrong by that: state "
+                f"{length_of(rms / 3**0.5, unit)} as their standard deviation (plate_sigma of a plate)."
+                if held
+                else "They were adjusted, so that the camera does not depend on a true plane."
+            )
+            yield Statement(
+                f"The board is not flat: its points lie up to {far} off a plane. {remedy} Fix the print to a "
+                "rigid plate before you photograph it again.",
+                "bad" if held else "fair",
+            )
         rows.append(
             (
                 "largest distance from the plane",
-                f"{significant(abs(off[worst]) * factor)} {fine}, at point "
-                f"{calibration.result.network.points[shape.points[worst]]}, "
-                f"{significant(abs(off[worst]) / max(off_sigma[worst], 1e-300), 2)} sigma",
+                f"{far}, at point {calibration.result.network.points[shape.points[worst]]}, "
+                f"{significant(sigmas[worst], 2)} sigma",
             )
         )
-    variance = np.diagonal(calibration.result.network.control.complete.covariance, axis1=1, axis2=2)
-    held = not (variance > 0).any()
     stated = float(np.sqrt(variance.max(initial=0.0)))
     rows.append(
         (
@@ -479,14 +508,18 @@ def _shape_parts(calibration: Calibration, shape: ObjectShape) -> Iterator[Part]
 
 def _next(calibration: Calibration, folder: str) -> Iterator[Part]:
     unit = calibration.result.length_unit
+    unknown = [camera.name for camera in calibration.cameras if not camera.next.poses]
+    if not calibration.cameras:
+        unknown = [camera.name for camera in calibration.result.estimate.cameras]
+    for name in unknown:
+        yield Statement(
+            f"Camera {name}: photograph the object tilted by 30 to 45 degrees, from several sides, in the "
+            "corners of the format and turned by 90 degrees.",
+            "fair",
+        )
     for number, camera in enumerate(calibration.cameras):
         further = camera.next
         if not further.poses:
-            yield Statement(
-                f"Camera {camera.name}: photograph the object tilted by 30 to 45 degrees, from several "
-                "sides, in the corners of the format and turned by 90 degrees.",
-                "fair",
-            )
             continue
         yield Heading(f"Next {counted(len(further.poses), 'photograph')} with camera {camera.name}")
         heads = columns("photograph", "object at", "tilt", "camera turned", ">distance", ">worst corner then")

@@ -47,6 +47,7 @@ from sfm.targets.codes.plates import PlateFamily, code_family, group_plates
 from sfm.targets.codes.rings import NECKLACES, RING_NAMES, RINGS, CodeFamily, RingCodes, RingReader
 from sfm.targets.codes.tags import (
     LARGEST_DICTIONARIES,
+    MIRRORED,
     TagFamily,
     corner_name,
     read_dictionaries,
@@ -138,7 +139,7 @@ def try_targets(
         progress: receives every photograph and family.
 
     Raises:
-        GeometryError: fewer than two of them can be decoded.
+        GeometryError: fewer than two of them can be decoded, or their tags are mirrored.
     """
     progress.stage("trial", TRIED + 5)
     files = _Files(folder, masks, store)
@@ -231,7 +232,11 @@ def _try_tags_and_boards(seen: _Seen, more: Sequence[Path], progress: Progress) 
         read += [read_dictionaries(photograph) for photograph in others]
     progress.advance("tags")
     family, largest = _shared_family(read)
+    _refuse_mirrored(read)
     if not family:
+        if not seen.plates:
+            flipped = [read_april_tags(np.ascontiguousarray(grey[:, ::-1]), KALIBR_TAGS) for grey in tried]
+            _refuse_mirrored([{KALIBR_TAGS + MIRRORED: tags} for tags in flipped])
         return
     tags = [read_tags.get(largest, NO_TAGS) for read_tags in read]
     charuco = search_charuco([*tried, *others], family, tags)
@@ -240,6 +245,22 @@ def _try_tags_and_boards(seen: _Seen, more: Sequence[Path], progress: Progress) 
     if not seen.plates:
         seen.measured = seen.plain if family == seen.tags else seen.measure(family)
         seen.counts[family] = _repeated_codes([targets.code for targets in seen.measured])
+
+
+def _refuse_mirrored(read: Sequence[Tags]) -> None:
+    """Refuse photographs whose tags are read in a mirror only.
+
+    Raises:
+        GeometryError: two of them show as many of these tags as orient a photograph.
+    """
+    for name in LARGEST_DICTIONARIES:
+        numbers = [np.unique(tags.get(name + MIRRORED, NO_TAGS)[0]).tolist() for tags in read]
+        repeated = _repeated_codes([np.array(codes, dtype=np.int64) for codes in numbers])
+        if len(repeated) >= TARGETS.fewest:
+            raise GeometryError(
+                f"the photographs show {len(repeated)} tags of {name} as in a mirror; print the board or the "
+                "tags anew, not mirrored, or use the original photographs if a program mirrored them"
+            )
 
 
 def _try_dots(seen: _Seen, others: Sequence[Path]) -> None:

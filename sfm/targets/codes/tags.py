@@ -7,6 +7,7 @@ A tag gives four named points: "7a" is the upper left corner of the black square
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cache
 
@@ -27,6 +28,7 @@ DICTIONARIES = {
     "aruco_original": "DICT_ARUCO_ORIGINAL",
     "aruco_mip_36h12": "DICT_ARUCO_MIP_36h12",
 }
+MIRRORED = "-mirrored"  # suffix of a name: read from a mirrored print or photograph
 # Without the dictionaries that are the first tags of a larger one.
 LARGEST_DICTIONARIES = tuple(name for name in DICTIONARIES if not name.endswith(("_50", "_100", "_250")))
 CORNERS = "abcd"
@@ -265,7 +267,8 @@ def read_dictionaries(photograph: AnyArray) -> dict[str, tuple[IntArray, FloatAr
 
     Returns:
         Numbers (t,) and corners (t, 4, 2), px, of the tags by the name of their dictionary. A dictionary that
-        is part of another is listed under the largest.
+        is part of another is listed under the largest. Where a mirror shows more tags, they are listed too,
+        by the name and MIRRORED.
     """
     settings = cv2.aruco.DetectorParameters()  # for small tags too; OpenCV begins at 45 px of 6000
     settings.minMarkerPerimeterRate = min(
@@ -273,27 +276,51 @@ def read_dictionaries(photograph: AnyArray) -> dict[str, tuple[IntArray, FloatAr
     )
     settings.minMarkerDistanceRate = NARROWEST_RIM  # else the edge of the paper stands for the tag on it
     finder = cv2.aruco.ArucoDetector(opencv_dictionary(LARGEST_DICTIONARIES[0]), settings)
-    for picture in (photograph, 255 - photograph):  # upright tags, or inverted ones
+    tags: dict[str, tuple[IntArray, FloatArray]] = {}
+    mirrored: dict[str, tuple[IntArray, FloatArray]] = {}
+    for picture in (photograph, 255 - photograph):  # dark tags, or inverted ones
         as_read, _, unread = finder.detectMarkers(picture)
         quads = np.array([*as_read, *unread], dtype=float).reshape(-1, 4, 2)
         if not len(quads):
             continue
-        # by quadrilateral and dictionary, once each, since some tags look the same when turned
-        read: dict[tuple[int, str], tuple[int, int]] = {}
-        for codes in _codes_by_size():
-            clear, is_tag = _read_modules(picture, quads, codes.modules)
-            wrong = np.bitwise_count(_words(clear)[:, None] ^ codes.words)
-            for row, k in zip(*np.nonzero(is_tag[:, None] & (wrong <= codes.correctable)), strict=True):
-                read.setdefault((int(row), codes.dictionary[k]), (int(codes.number[k]), int(codes.turn[k])))
-        if read:
-            tags: dict[str, tuple[IntArray, FloatArray]] = {}
-            for name in LARGEST_DICTIONARIES:
-                seen = [(row, *tag) for (row, of), tag in read.items() if of == name]
-                if seen:
-                    corners = [np.roll(quads[row], -turn, axis=0) for row, _, turn in seen]
-                    tags[name] = np.array([number for _, number, _ in seen]), np.array(corners)
-            return tags
-    return {}
+        modules = [(codes, *_read_modules(picture, quads, codes.modules)) for codes in _codes_by_size()]
+        tags = _tags_in(quads, modules)
+        flipped = [(codes, clear[:, :, ::-1], is_tag) for codes, clear, is_tag in modules]
+        mirrored = max(mirrored, _tags_in(quads[:, [1, 0, 3, 2]], flipped), key=_most)
+        if tags:
+            break
+    if _most(mirrored) > _most(tags):
+        tags |= {name + MIRRORED: read for name, read in mirrored.items()}
+    return tags
+
+
+def _most(tags: dict[str, tuple[IntArray, FloatArray]]) -> int:
+    """Return the number of tags of the dictionary that has most."""
+    return max((len(number) for number, _ in tags.values()), default=0)
+
+
+def _tags_in(
+    quads: FloatArray, modules: Sequence[tuple[_Codes, BoolArray, BoolArray]]
+) -> dict[str, tuple[IntArray, FloatArray]]:
+    """Return numbers and corners of the tags in quadrilaterals, by the name of their dictionary.
+
+    Args:
+        quads: corners, px, (q, 4, 2).
+        modules: codes of one size, clear modules of that size, (q, n, n), and what looks like a tag, (q,).
+    """
+    # by quadrilateral and dictionary, once each, since some tags look the same when turned
+    read: dict[tuple[int, str], tuple[int, int]] = {}
+    for codes, clear, is_tag in modules:
+        wrong = np.bitwise_count(_words(clear)[:, None] ^ codes.words)
+        for row, k in zip(*np.nonzero(is_tag[:, None] & (wrong <= codes.correctable)), strict=True):
+            read.setdefault((int(row), codes.dictionary[k]), (int(codes.number[k]), int(codes.turn[k])))
+    tags: dict[str, tuple[IntArray, FloatArray]] = {}
+    for name in LARGEST_DICTIONARIES:
+        of_name = [(row, *tag) for (row, of), tag in read.items() if of == name]
+        if of_name:
+            corners = [np.roll(quads[row], -turn, axis=0) for row, _, turn in of_name]
+            tags[name] = np.array([number for _, number, _ in of_name]), np.array(corners)
+    return tags
 
 
 @dataclass(frozen=True)

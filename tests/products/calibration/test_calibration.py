@@ -11,6 +11,7 @@ import pytest
 
 import sfm
 from sfm.judgement.survey_result import SurveyResult
+from sfm.model.camera import camera_from_values
 from sfm.model.errors import GeometryError
 from sfm.model.remarks.remark import kinds_of, of_kind
 from sfm.products.calibration.calibration import Calibration, calibrate
@@ -114,7 +115,10 @@ def test_a_bent_board_is_seen(tmp_path: Path) -> None:
     assert found.shape is not None and found.shape.flat
     off, sigma = found.shape.off_plane
     assert 0.8 < np.ptp(off) / 2.0 < 1.2 and np.median(sigma) < 0.2  # its sagitta
-    assert "Board" in text(page(found)) and "coordinates adjusted, given with" in text(page(found))
+    words = text(page(found))
+    assert "Board" in words and "coordinates adjusted, given with" in words
+    assert "The board is not flat" in words and "the camera does not depend on a true plane" in words
+    assert "Fix the print to a rigid plate" in words
     assert "given_scatter" in kinds_of(found.remarks) and verdict_of(found).level == "fair"
 
 
@@ -125,6 +129,17 @@ def test_frontal_photographs_do_not_make_a_camera(tmp_path: Path) -> None:
     assert verdict_of(found).headline == "Do not trust this calibration."
     words = text(page(found))
     assert html(page(found)) and "not determined" in words and "Use it" not in words
+
+
+def test_a_camera_that_was_not_adjusted_has_a_page(tmp_path: Path) -> None:
+    """Without `free` the program holds the camera of frontal photographs."""
+    board = simulated_board(seed_of("frontal"), tilt_deg=0.0, distance=(400.0, 400.0), photographs=8)
+    found = calibrate(surveyed(tmp_path, board, free=""))
+    assert not found.cameras and "held_parameter" in kinds_of(found.remarks)
+    assert verdict_of(found).headline == "Do not trust this calibration."
+    words = text(page(found))
+    assert "The image points contradict the held values" in words and "No camera is known anywhere" in words
+    assert "tilted by 30 to 45 degrees" in words and "Use it" not in words and html(page(found))
 
 
 def test_a_zoomed_camera_is_named(tmp_path: Path) -> None:
@@ -145,7 +160,8 @@ def test_three_photographs_are_not_divided(tmp_path: Path) -> None:
 
 
 def test_a_held_camera_is_no_calibration(tmp_path: Path) -> None:
-    result = surveyed(tmp_path, simulated_board(seed_of("held")), free="free = []")
+    straight = camera_from_values("cam", "brown", (1200, 900), (0.005, 0.005), c_mm=6.0)
+    result = surveyed(tmp_path, simulated_board(seed_of("held"), camera=straight), free="free = []")
     with pytest.raises(GeometryError, match="no camera was adjusted, so that nothing is calibrated"):
         calibrate(result)
 

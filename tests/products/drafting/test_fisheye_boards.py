@@ -12,6 +12,7 @@ import numpy as np
 import pytest
 
 from sfm.model.conventions import AnyArray, rotation_from_angles
+from sfm.model.errors import GeometryError
 from sfm.model.remarks.remark import kinds_of
 from sfm.products.drafting import target_trial
 from sfm.products.drafting.draft import draft_survey
@@ -21,6 +22,7 @@ from sfm.survey.target_network import UNNAMED
 from sfm.targets.codes.plate_search import part_of_checkerboard
 from sfm.targets.codes.plates import PlateFamily
 from sfm.targets.codes.rings import ring_family
+from tests.plates import plate_pictures
 from tests.synthetic import seed_of
 
 SIZE = (1000, 750)
@@ -100,3 +102,19 @@ def test_nothing_is_said_on_codes_of_a_plate() -> None:
     assert one.names("photographs") == ("a.jpg", "b.jpg", "c.jpg") and "ode" not in one.text.split("plate")[0]
     of_codes = remarks_on_contested(found, photographs, naming, {}, ring_family("ring14"))
     assert kinds_of(of_codes) == ("codes_at_several_places",)
+
+
+@pytest.mark.parametrize(
+    "plate",
+    [
+        PlateFamily("charuco", 7, 10, (), "aruco5x5_50", 0.6),
+        PlateFamily("aprilgrid", 8, 10, (), "apriltag36h11", 0.77),
+    ],
+    ids=lambda plate: plate.name,
+)
+def test_mirrored_boards_with_tags_are_named(tmp_path: Path, plate: PlateFamily) -> None:
+    """Not taken for a checkerboard or for texture."""
+    for k, picture in enumerate(plate_pictures(plate, seed_of("mirrors"), 4)):
+        cv2.imwrite(str(tmp_path / f"photo {k}.png"), picture[:, ::-1], [cv2.IMWRITE_PNG_COMPRESSION, 1])
+    with pytest.raises(GeometryError, match=r"tags of .* as in a mirror; print the board"):
+        draft_survey(tmp_path)
