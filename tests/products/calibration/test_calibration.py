@@ -115,7 +115,7 @@ def test_a_bent_board_is_seen(tmp_path: Path) -> None:
     assert found.shape is not None and found.shape.flat
     off, sigma = found.shape.off_plane
     assert 0.8 < np.ptp(off) / 2.0 < 1.2 and np.median(sigma) < 0.2  # its sagitta
-    words = text(page(found))
+    words = " ".join(text(page(found)).split())
     assert "Board" in words and "coordinates adjusted, given with" in words
     assert "The board is not flat" in words and "the camera does not depend on a true plane" in words
     assert "Fix the print to a rigid plate" in words
@@ -137,7 +137,7 @@ def test_a_camera_that_was_not_adjusted_has_a_page(tmp_path: Path) -> None:
     found = calibrate(surveyed(tmp_path, board, free=""))
     assert not found.cameras and "held_parameter" in kinds_of(found.remarks)
     assert verdict_of(found).headline == "Do not trust this calibration."
-    words = text(page(found))
+    words = " ".join(text(page(found)).split())
     assert "The image points contradict the held values" in words and "No camera is known anywhere" in words
     assert "tilted by 30 to 45 degrees" in words and "Use it" not in words and html(page(found))
 
