@@ -71,10 +71,13 @@ DISTORTION |= {
         *(("p0", 3e-4), ("p1", -2e-4), ("s0", 1e-3), ("s1", 2e-3), ("s2", -5e-4), ("s3", 1e-3)),
     ),
 }
-DISTORTION["splined"] = (
-    *(("cx", 1005.0), ("a_max", 0.55), ("b_max", 0.4)),
-    *((name, 1e-3 * (7 * k % 11 - 5)) for k, name in enumerate(SPLINED.names_of(Role.SURFACE))),
-)
+for splined in SPLINED:
+    surface = splined.names_of(Role.SURFACE)
+    steep = 30.0 * len(surface) ** -1.5  # third derivatives of the same size on every grid
+    DISTORTION[splined.name] = (
+        *(("cx", 1005.0), ("a_max", 0.55), ("b_max", 0.4)),
+        *((name, 0.1 * steep * (7 * k % 11 - 5)) for k, name in enumerate(surface)),
+    )
 FREE = {
     "brown": ("c", "x0", "y0", "K1", "K2", "P1", "P2"),
     "brown_forward": ("c", "x0", "y0", "K1", "K2", "P1", "P2"),
@@ -85,7 +88,7 @@ FREE["brown_dbat"] = FREE["brown"]
 FREE["brown_forward_affine"] = (*FREE["brown_forward"], "b1", "b2")
 FREE["brown_affine"] = FREE["brown_affine_dbat"] = (*FREE["brown"], "b1")
 FREE |= {model.name: model.names for model in COLMAP}
-FREE["splined"] = ("fx", "fy", "cx", "cy")
+FREE |= {splined.name: ("fx", "fy", "cx", "cy") for splined in SPLINED}
 
 
 def seed_of(name: str) -> np.random.Generator:

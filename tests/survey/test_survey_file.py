@@ -224,8 +224,10 @@ def test_the_second_of_two_cameras_is_named(tmp_path: Path) -> None:
 @pytest.mark.parametrize("line", ["", "c_mm = 8.0\n", "fixed = { a_max = 0.5, b_max = 0.4, A0_0 = 0.0 }\n"])
 def test_a_splined_camera_comes_from_a_calibration(tmp_path: Path, line: str) -> None:
     missing = 199 if "fixed" in line else 202
-    text = MINIMAL + f'model = "splined"\n{line}'
-    expected = f"model splined needs the values of 202 parameters of its surface, {missing} are missing; give"
+    text = MINIMAL + f'model = "splined_10"\n{line}'
+    expected = (
+        f"model splined_10 needs the values of 202 parameters of its surface, {missing} are missing; give"
+    )
     with pytest.raises(SurveyFileError, match=expected):
         read_survey_file(write(tmp_path, text))
 

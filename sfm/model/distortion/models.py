@@ -274,20 +274,27 @@ WIDE_ANGLE = (
     ),
 )
 COLMAP = (*PERSPECTIVE, *WIDE_ANGLE)
-_GRID = [f"{j}_{i}" for j in range(KNOTS) for i in range(KNOTS)]
-# the model for lenses that no other describes; fitted to the image points of another model
-SPLINED = Model(
-    "splined",
-    splined,
-    (
-        *_TWO,
-        *_parameters(Role.RANGE, "a_max b_max", "1"),
-        *_parameters(Role.SURFACE, " ".join(f"A{place}" for place in _GRID), "1"),
-        *_parameters(Role.SURFACE, " ".join(f"B{place}" for place in _GRID), "1"),
-    ),
-    stereographic=True,
-)
-ALL = (*GENERAL, *COLMAP, SPLINED)
+
+
+def _splined(knots: int) -> Model:
+    """Return the model with a surface of knots x knots coefficients."""
+    grid = [f"{j}_{i}" for j in range(knots) for i in range(knots)]
+    return Model(
+        f"splined_{knots}",
+        splined,
+        (
+            *_TWO,
+            *_parameters(Role.RANGE, "a_max b_max", "1"),
+            *_parameters(Role.SURFACE, " ".join(f"A{place}" for place in grid), "1"),
+            *_parameters(Role.SURFACE, " ".join(f"B{place}" for place in grid), "1"),
+        ),
+        stereographic=True,
+    )
+
+
+# models for lenses that no other describes; fitted to the image points of another model
+SPLINED = tuple(_splined(knots) for knots in KNOTS)
+ALL = (*GENERAL, *COLMAP, *SPLINED)
 MODELS = {model.name: model for model in ALL}
 OF_COLMAP = frozenset(("opencv", "full_opencv", *(model.name for model in COLMAP)))  # models that it has
 GENERAL_MODELS = tuple(model.name for model in GENERAL)

@@ -375,7 +375,8 @@ def _model_parts(camera: CameraCalibration, level: float, folder: str) -> Iterat
         words.append(
             f"A splined camera describes the lens better: its surface departs from {camera.camera.model} by "
             f"{significant(splined.sigma_px)} px, image points determine {splined.determined:.0f} of its "
-            f"{int(splined.camera.free.sum())} coefficients, and sigma0 falls to "
+            f"{int(splined.camera.free.sum())} coefficients on a grid of {splined.knots} x {splined.knots}, "
+            "and sigma0 falls to "
             f"{significant(splined.adjustment.sigma0_px)} px. Use it with --camera "
             f"{shlex.quote(f'{folder}/{splined_folder(camera)}')}."
         )
@@ -690,6 +691,7 @@ def _camera_summary(calibration: Calibration, camera: CameraCalibration) -> dict
             "folder": splined_folder(camera),
             "sigma_px": camera.splined.sigma_px,
             "determined": camera.splined.determined,
+            "knots": camera.splined.knots,
             "gain": camera.splined.gain,
             "price": camera.splined.price,
             "sigma0_px": camera.splined.adjustment.sigma0_px,

@@ -17,7 +17,7 @@ from sfm.model.conventions import FloatArray, skew
 from sfm.model.errors import GeometryError
 from sfm.products.calibration import projection_uncertainty, spline_camera
 from sfm.products.calibration.residual_field import residual_field
-from sfm.products.calibration.splined import SplinedCalibration, splined_like
+from sfm.products.calibration.splined import SplinedCalibration, _with_knots, splined_like
 from tests.commands import kolinear
 from tests.products.calibration.boards import CAMERA, simulated_board
 from tests.products.calibration.strange_lenses import noisy, strange_board, waves, with_everything_free
@@ -41,11 +41,11 @@ def splined(parametric: Adjustment) -> SplinedCalibration:
     return spline_camera(parametric)
 
 
-def errors(camera: Camera, inside: FloatArray) -> FloatArray:
+def errors(camera: Camera, inside: FloatArray, finer: float = 1.0) -> FloatArray:
     """Errors of projection of far points over the format, RMS of both coordinates, after one rotation, px."""
     rays = rays_from_pixel(CAMERA, GRID)
     seen = pixel_from_rays(camera, rays)
-    error = seen - (GRID + waves(GRID))
+    error = seen - (GRID + waves(GRID, finer))
     turned = ray_jacobian(camera, seen, rays) @ -skew(rays)
     sound = inside & np.isfinite(turned).all(axis=(1, 2))
     w = np.linalg.lstsq(turned[sound].reshape(-1, 3), error[sound].ravel(), rcond=None)[0]
@@ -78,6 +78,47 @@ def test_sigma_grows_where_there_are_no_image_points(
     assert 0.4 < np.sqrt(np.mean((error / sigma[far]) ** 2)) < 2.5
     wrong = errors(parametric.estimate.cameras[0], inside)[far]
     assert np.sqrt(np.mean((wrong / lean[far]) ** 2)) > 3, "the parametric model does not know"
+
+
+def test_the_stated_precision_of_image_points_does_not_matter(
+    parametric: Adjustment, splined: SplinedCalibration
+) -> None:
+    """Ten times too small: sigma0 is 10, and surface, its size and its sigmas are the same."""
+    network = parametric.network
+    stated = replace(network.image_points, covariance=network.image_points.covariance / 100)
+    a = sfm.adjust(replace(network, image_points=stated), parametric.estimate, datum="control", reject="none")
+    other = _with_knots(a, 0, splined.knots)
+    assert other.adjustment.sigma0 == pytest.approx(10 * splined.adjustment.sigma0, rel=1e-3)
+    assert other.sigma_px == splined.sigma_px and other.gain == pytest.approx(splined.gain, rel=1e-3)
+    rays = rays_from_pixel(CAMERA, GRID)
+    moved = pixel_from_rays(other.camera, rays) - pixel_from_rays(splined.camera, rays)
+    assert np.abs(moved).max() < 1e-2
+    sigmas = [
+        projection_uncertainty(a).sigma_at(GRID, np.inf) for a in (splined.adjustment, other.adjustment)
+    ]
+    np.testing.assert_allclose(*sigmas, rtol=1e-2)
+
+
+def test_the_image_points_choose_the_grid(parametric: Adjustment, splined: SplinedCalibration) -> None:
+    assert splined.knots == 10
+    coarse, fine = (_with_knots(parametric, 0, knots) for knots in (7, 14))
+    assert max(coarse.gain, fine.gain) < splined.gain - 10
+    inside = observed_part(parametric.network.image_points.xy, GRID)[1]
+    best, *others = (
+        np.sqrt((errors(one.camera, inside)[inside] ** 2).mean()) for one in (splined, coarse, fine)
+    )
+    assert best < min(others)
+
+
+@pytest.mark.slow
+def test_shorter_waves_need_a_finer_grid() -> None:
+    board = strange_board(seed_of("strange"), photographs=60, finer=2.0)
+    start = with_everything_free(board.truth)
+    a = sfm.adjust(noisy(board, seed_of("strange noise")), start, datum="control", reject="none")
+    fine = spline_camera(a)
+    assert fine.knots == 20 and fine.camera.model == "splined_20"
+    inside = observed_part(a.network.image_points.xy, GRID)[1]
+    assert np.sqrt((errors(fine.camera, inside, 2.0)[inside] ** 2).mean()) < 0.02
 
 
 @pytest.mark.slow
@@ -113,12 +154,12 @@ def test_the_surface_starts_as_the_adjusted_model(model: str) -> None:
     c_mm = 6.0 if model == "brown" else 1.75
     camera = sfm.camera_from_values("a", model, (1200, 900), (0.005, 0.005), c_mm=c_mm, values=values)
     seen = GRID if model == "brown" else GRID[np.linalg.norm(GRID - (599.5, 449.5), axis=1) < 570]
-    surface = splined_like(camera, seen)
+    surface = splined_like(camera, seen, 14)
     rays = rays_from_pixel(camera, seen)
     error = pixel_from_rays(surface, rays) - seen
     most, rms = (0.02, 0.005) if model == "brown" else (0.15, 0.03)  # of 190 degrees, at the border
     assert np.abs(error).max() < most and np.sqrt((error**2).mean()) < rms
-    assert surface.free.sum() == 200 and (surface.value("a_max") > 1.9) == (model != "brown")
+    assert surface.free.sum() == 2 * 14**2 and (surface.value("a_max") > 1.9) == (model != "brown")
 
 
 def test_cameras_of_single_photographs_are_refused() -> None:
@@ -149,14 +190,19 @@ def test_calibrate_offers_a_splined_camera_that_other_commands_use(
     result = sfm.read_result(out / "splined-cam")
     (lens,) = result.estimate.cameras
     again = sfm.read_cameras(out / "splined-cam")
-    assert lens.model == "splined" and (again.cameras[0].parameters == lens.parameters).all()
+    assert lens.model.startswith("splined_") and (again.cameras[0].parameters == lens.parameters).all()
     assert again.covariance[0] is not None and (np.diagonal(again.covariance[0])[6:] > 0).all()
     capsys.readouterr()
     assert kolinear("compare", out, out / "splined-cam", "--cameras", "--out", tmp_path / "difference") == 0
     assert "more than chance" in capsys.readouterr().out
     assert kolinear("convert", out / "splined-cam", tmp_path / "a.yaml", "--to", "opencv-camera") == 2
     said = capsys.readouterr().err
-    assert "differs from splined by 0.2" in said and "px RMS" in said and not (tmp_path / "a.yaml").exists()
+    assert (
+        "differs from splined_" in said
+        and " by 0.2" in said
+        and "px RMS" in said
+        and not (tmp_path / "a.yaml").exists()
+    )
     known = path.read_text(encoding="utf-8").replace(EVERYTHING, f'calibration = "{out / "splined-cam"}"')
     known = known.replace("c_mm = 6.0\n", "").replace("pixel_mm = [0.005, 0.005]\n", "")
     (tmp_path / "s" / "known.toml").write_text(known, encoding="utf-8")
