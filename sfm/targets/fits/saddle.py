@@ -29,6 +29,9 @@ ROUNDS, LAST_STEP_PX = 20, 1e-3
 MAX_OFF_FRACTION = 1.0  # maximum distance of a crossing from its expected position, in half windows
 MIN_SINE = 0.3  # of the angle between the two edges, as of rows and columns of a lattice; a single edge has 0
 SMOOTHING_PX = 0.7  # of the gradients
+SMOOTHED_PX = math.sqrt(
+    SMOOTHING_PX**2 + 1 / 3
+)  # standard deviation of an edge that was sharp, with its pixels
 MIN_BLUR_PX = 0.1  # smallest blur distinguishable from that of the filters
 REACH_PX = 4  # of the filters
 
@@ -62,7 +65,7 @@ def measure_saddles(image: AnyArray, start: FloatArray, half_px: FloatArray, *, 
     out = Saddles(*empty, np.full(k, np.nan), np.full(k, np.nan))
     if not k:
         return out
-    half = np.clip(np.floor(half_px), MIN_HALF_PX, MAX_HALF_PX).astype(np.int64)
+    half = window_half(half_px)
     smooth, gx, gy = _filtered(image, start, half)
     _measure_all(
         smooth,
@@ -77,6 +80,11 @@ def measure_saddles(image: AnyArray, start: FloatArray, half_px: FloatArray, *, 
         out.blur,
     )
     return out
+
+
+def window_half(half_px: FloatArray) -> IntArray:
+    """Return the half sides of the windows that are used where larger ones are allowed, px, (k,)."""
+    return np.clip(np.floor(half_px), MIN_HALF_PX, MAX_HALF_PX).astype(np.int64)
 
 
 def _filtered(image: AnyArray, start: FloatArray, half: IntArray) -> tuple[AnyArray, AnyArray, AnyArray]:
