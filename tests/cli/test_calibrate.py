@@ -53,7 +53,11 @@ def test_a_folder_of_a_board_becomes_a_judged_camera(
 
 def test_the_model_of_a_draft_may_be_given(photographs: Path, tmp_path: Path) -> None:
     out = tmp_path / "out"
-    assert kolinear("calibrate", photographs, "--out", out, "--model", "opencv", "--jobs", 1) == 0
+    file = tmp_path / "camera.yaml"
+    arguments = (photographs, "--out", out, "--model", "opencv", "--jobs", 1, "--export", file)
+    assert kolinear("calibrate", *arguments) == 0
+    storage = cv2.FileStorage(str(file), cv2.FILE_STORAGE_READ)
+    assert abs(storage.getNode("K").mat()[0, 0] - TRUTH["c"] / PIXEL_MM) < 1.0
     (camera,) = json.loads((out / "calibration.json").read_text(encoding="utf-8"))["cameras"]
     assert camera["model"] == "opencv" and set(camera["focal_px"]) == {"fx", "fy"}
 
@@ -62,6 +66,7 @@ def test_wrong_options_are_refused_before_work(tmp_path: Path, capsys: pytest.Ca
     assert "--model 'pinehole', expected one of" in refused(
         capsys, "calibrate", tmp_path, "--model", "pinehole"
     )
+    assert "--export is not for --watch" in refused(capsys, "calibrate", tmp_path, "--export", "a", "--watch")
     assert "--distance -1, expected more than 0" in refused(capsys, "calibrate", tmp_path, "--distance", -1)
 
 

@@ -63,6 +63,18 @@ def calibrate(
             help="Uncertainty of the worst corner, far points, 1 sigma, at which --watch ends.",
         ),
     ] = 0.0,
+    export: Annotated[
+        Path | None,
+        typer.Option(
+            "--export",
+            metavar="FILE",
+            help="Write the cameras of a dependable calibration into this new file too, as by kolinear "
+            "convert.",
+        ),
+    ] = None,
+    to: Annotated[
+        str, typer.Option("--to", metavar="FORMAT", help="Format of --export, one of cameras.")
+    ] = "opencv-camera",
     overwrite: Overwrite = False,
     jobs: Jobs = None,
     pdf: Pdf = False,
@@ -88,7 +100,15 @@ def calibrate(
 
         if model not in MODELS:
             raise KolinearError(f"--model '{model}', expected one of {', '.join(MODELS)}")
-    product = _Product(distances=distances, until=until, is_watched=watched)
+    if export is not None:
+        from adapters.formats.cameras.registry import camera_format
+        from sfm.files.whole_files import refuse_existing
+
+        if watched:
+            raise KolinearError("--export is not for --watch; use kolinear convert on the result")
+        camera_format(to)
+        refuse_existing(export)
+    product = _Product(distances=distances, until=until, is_watched=watched, export=export, to=to)
 
     def edit(text: str) -> str:
         return _for_calibration(text, model)
@@ -137,6 +157,8 @@ class _Product(WatchedSurvey):
     distances: tuple[float, ...] = ()
     calibration: Calibration | None = None  # once it is written
     page: Page | None = None
+    export: Path | None = None  # file for another program
+    to: str = ""  # its format
 
     def revise(self, survey_file: Path, result: SurveyResult) -> bool:
         """Free the points of a plate that is not as given, with the precision that the image points show."""
@@ -197,6 +219,10 @@ class _Product(WatchedSurvey):
                 print("".join(f"  {line}\n" for line in part.text.splitlines()), end="")
         print_page("Report", folder / "report.html", pdf=pdf)
         print_page("Calibration", folder / declared.path, pdf=pdf)
+        if self.export is not None and self.is_dependable:
+            from sfm.cli.written_cameras import write_camera_files
+
+            print(write_camera_files(folder, self.export, self.to))
         return self.is_dependable
 
     def uncertainty(self) -> float:
