@@ -82,17 +82,22 @@ def _remarks(comparison: ResultComparison) -> Iterator[Remark]:
         yield remark("differences_tested", how="singly", **counted_points)
     elif tested <= MAX_POINTS < len(comparison.points):
         yield remark("differences_tested", how="jointly", **counted_points)
-    too_lean = any(weakness.camera is not None for weakness in comparison.weaker)
+    too_lean = any(weakness.cameras for weakness in comparison.weaker)
     if comparison.changed and comparison.independent and not too_lean:
         yield from _remarks_on_cameras(comparison)
     for weakness in comparison.weaker:
-        between = {"weaker": weakness.name, "of": weakness.of}
-        if weakness.sigma_px is not None:
-            sigmas = {"theirs": (weakness.sigma_px, "px"), "ours": (weakness.of_sigma_px, "px")}
-            yield remark("weaker_solution", **sigmas, **between)
-        if weakness.camera is not None:
-            fits = {"fits": (weakness.with_model_px, "px"), "own": (weakness.own_px, "px")}
-            yield remark("weaker_solution", model=weakness.model, camera=weakness.camera, **fits, **between)
+        lean = bool(weakness.cameras)
+        yield remark(
+            "weaker_solution",
+            weaker=weakness.name,
+            of=weakness.of,
+            theirs=(weakness.sigma_px, "px") if weakness.sigma_px is not None else None,
+            ours=(weakness.own_px if lean else weakness.of_sigma_px, "px"),  # one number of both
+            model=weakness.model if lean else None,
+            cameras=weakness.cameras if lean else None,
+            fits=(weakness.with_model_px, "px") if lean else None,
+            own=(weakness.own_px, "px") if lean else None,
+        )
 
 
 def _remarks_on_differences(comparison: ResultComparison, tested: int) -> Iterator[Remark]:

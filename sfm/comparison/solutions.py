@@ -19,7 +19,7 @@ from sfm.adjustment.result import Adjustment, Covariance
 from sfm.comparison.pairing import rounding_of
 from sfm.model.arguments import checked_arguments
 from sfm.model.camera import Camera, pixel_from_rays, project, rays_from_pixel
-from sfm.model.conventions import FloatArray
+from sfm.model.conventions import MAD_TO_SIGMA, FloatArray
 from sfm.model.display import counted
 from sfm.model.errors import GeometryError
 from sfm.model.estimate import Estimate
@@ -29,6 +29,8 @@ from sfm.orientation.image_rays import image_tangents
 from sfm.orientation.intersection import intersect
 
 MIN_RAYS = 2
+DATUM = 7  # coordinates, angles and scale that image points do not tell
+LEAST_SIGMA_PX = 1e-3  # of image points that a model fits without residuals, as those of a simulation
 EFFECT_STEPS = 9  # positions along each side of the photograph where interior orientations are compared
 ROUNDING_PX = 1e-7  # rounding errors of residuals, and of interior orientation in the photograph
 ROUNDING_RAD = 1e-9
@@ -227,6 +229,24 @@ def reprojection(network: Network, estimate: Estimate) -> FloatArray:
         )
         v[rows] = computed - seen.xy[rows]
     return v[use]
+
+
+def redundancy_of(seen: ImagePoints) -> int:
+    """Return the redundancy of image points with all their photographs and points unknown, at least 1."""
+    unknowns = 6 * len(np.unique(seen.image)) + 3 * len(np.unique(seen.point)) - DATUM
+    return max(2 * len(seen) - unknowns, 1)
+
+
+def robust_sigma_px(residuals: FloatArray, redundancy: int) -> float:
+    """Return the robust standard deviation of a coordinate, px: residuals are smaller than errors.
+
+    Args:
+        residuals: of image points, px, (k, 2).
+        redundancy: of the image points.
+    """
+    share = min(1.0, redundancy / residuals.size)
+    spread = MAD_TO_SIGMA * float(np.median(np.abs(residuals)))
+    return max(spread / float(np.sqrt(share)), LEAST_SIGMA_PX)
 
 
 def rotation_angle_deg(a: FloatArray, b: FloatArray) -> FloatArray:

@@ -10,7 +10,7 @@ Source: Foerstner and Wrobel (2016), Photogrammetric Computer Vision, sec. 4.6.8
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections import defaultdict
 from dataclasses import dataclass
 
 import numpy as np
@@ -18,8 +18,9 @@ import numpy as np
 from sfm.comparison.camera_conversion import convert_camera
 from sfm.comparison.camera_readjustment import adjusted_with
 from sfm.comparison.pairing import Pairing
-from sfm.comparison.solutions import reprojection
-from sfm.model.conventions import MAD_TO_SIGMA
+from sfm.comparison.solutions import redundancy_of, reprojection, robust_sigma_px
+from sfm.model.camera import Camera
+from sfm.model.distortion.models import Role
 from sfm.model.distributions import LEVEL, MIN_LEAD, f_sf
 from sfm.model.errors import GeometryError, SurveyFileError
 from sfm.model.likelihood import price_of
@@ -37,8 +38,8 @@ class Weakness:
     of: str  # name of the other one
     sigma_px: float | None  # robust standard deviation of its image coordinates, px; None: not worse
     of_sigma_px: float  # the same of the other one, px
-    camera: str | None = None  # camera of the other one that its lens model does not describe; None: not so
-    model: str = ""  # that lens model
+    cameras: tuple[str, ...] = ()  # cameras of the other one that its lens model does not describe
+    model: str = ""  # that lens model, with the terms that are not used
     with_model_px: float = np.nan  # standard deviation of the other one's image coordinates with it, px
     own_px: float = np.nan  # the same with its own cameras, px
 
@@ -61,54 +62,76 @@ def weaker_solutions(a: Solution, b: Solution, pairing: Pairing) -> tuple[Weakne
     }  # of the common photographs
     if any(a.estimate.cameras[p].size_px != b.estimate.cameras[q].size_px for p, q in cameras):
         return ()  # photographs of another size have other pixels
-    weaknesses = []
-    for weaker, other, pairs in ((b, a, {(q, p) for p, q in cameras}), (a, b, cameras)):
-        theirs, freedom = _sigma_px(weaker)
-        ours, of_freedom = _sigma_px(other)
-        lens = next(_leaner_lenses(weaker, other, sorted(pairs)), None)
-        misfit = 1.0 if lens is None else lens[2] / lens[3]  # the lens alone makes residuals so much larger
-        freedoms = (MAD_EFFICIENCY * freedom, MAD_EFFICIENCY * of_freedom)
-        coarse = ours > 0 and float(f_sf((theirs / (misfit * ours)) ** 2, *freedoms)) < LEVEL
-        if coarse or lens is not None:
-            sigma_px = theirs if coarse else None
-            weaknesses.append(Weakness(weaker.name, other.name, sigma_px, ours, *(lens or ())))
-    return tuple(weaknesses)
+    return tuple(
+        weakness
+        for weaker, other, pairs in ((b, a, {(q, p) for p, q in cameras}), (a, b, cameras))
+        if (weakness := _weakness(weaker, other, sorted(pairs))) is not None
+    )
+
+
+def _weakness(weaker: Solution, other: Solution, cameras: list[tuple[int, int]]) -> Weakness | None:
+    """Return why a solution is weaker than another one; None if it is not, or not beyond chance."""
+    theirs, freedom = _sigma_px(weaker)
+    ours, of_freedom = _sigma_px(other)
+    lens = _leaner_lens(weaker, other, cameras)
+    misfit = 1.0 if lens is None else lens[2] / lens[3]  # the lens alone makes residuals so much larger
+    freedoms = (MAD_EFFICIENCY * freedom, MAD_EFFICIENCY * of_freedom)
+    coarse = float(f_sf((theirs / (misfit * ours)) ** 2, *freedoms)) < LEVEL
+    if lens is None and not coarse:
+        return None
+    return Weakness(weaker.name, other.name, theirs if coarse else None, ours, *(lens or ()))
 
 
 def _sigma_px(solution: Solution) -> tuple[float, int]:
-    """Return the robust standard deviation of an image coordinate, px, and its degrees of freedom."""
-    v = reprojection(solution.network, solution.estimate)
-    seen = solution.network.image_points
-    unknowns = 6 * len(np.unique(seen.image)) + 3 * len(np.unique(seen.point)) - 7
-    freedom = max(v.size - unknowns, 1)
-    spread = MAD_TO_SIGMA * float(np.median(np.abs(v))) if v.size else np.nan
-    return spread / float(np.sqrt(min(1.0, freedom / max(v.size, 1)))), freedom
+    """Return the robust standard deviation of an image coordinate, px, NaN if unknown, and its redundancy."""
+    network, estimate = solution.network, solution.estimate
+    seen = network.image_points
+    used = seen.select(estimate.oriented[seen.image] & estimate.determined[seen.point])
+    v = reprojection(network, estimate)
+    v = v[np.isfinite(v).all(axis=1)]
+    redundancy = redundancy_of(used)
+    return robust_sigma_px(v, redundancy) if len(v) else np.nan, redundancy
 
 
-def _leaner_lenses(
+def _leaner_lens(
     weaker: Solution, other: Solution, cameras: list[tuple[int, int]]
-) -> Iterator[tuple[str, str, float, float]]:
-    """Yield cameras of the other solution that the lens model of the weaker one does not describe.
+) -> tuple[tuple[str, ...], str, float, float] | None:
+    """Return cameras of the other solution that the lens model of the weaker one does not describe, or None.
 
-    With each its name, that model, and the standard deviation of an image coordinate with it and without, px.
+    With them that model, and the standard deviation of an image coordinate with it and without, px. Cameras
+    that have one model in the weaker solution are adjusted together.
     """
-    before = None
-    for q, p in {q: p for p, q in reversed(cameras)}.items():  # each camera of the other one once
+    leaner: dict[str, dict[str, Camera]] = defaultdict(dict)
+    prices: dict[str, float] = defaultdict(float)
+    cameras_of = other.network.camera[other.network.image_points.image]
+    for q, p in sorted({q: p for p, q in reversed(cameras)}.items()):  # each camera of the other one once
         ours, theirs = other.estimate.cameras[q], weaker.estimate.cameras[p]
         used = zip(theirs.names, theirs.parameters, strict=True)
+        held = tuple(name for name, value in used if value == 0)
         try:  # with only the terms that are used there
-            held = tuple(name for name, value in used if value == 0)
-            leaner = convert_camera(ours, theirs.model, held=held).camera
+            camera = convert_camera(ours, theirs.model, held=held).camera
         except (GeometryError, SurveyFileError):
             continue
-        saved = int(ours.free.sum()) - int(leaner.free.sum())
-        if saved <= 0:
-            continue
-        before = before or adjusted_with(other, {})
-        after = adjusted_with(other, {ours.name: leaner})
-        if before is None or after is None or not before.vPv > 0:
+        saved = _free_terms(ours) - _free_terms(camera)
+        if saved > 0:
+            model = f"{theirs.model} without {', '.join(held)}" if held else theirs.model
+            leaner[model][ours.name] = camera
+            prices[model] += price_of(saved, int((cameras_of == q).sum()))
+    before = adjusted_with(other, {}) if leaner else None
+    if before is None or not before.vPv > 0:
+        return None
+    for model, replaced in leaner.items():
+        after = adjusted_with(other, replaced)
+        if after is None:
             continue
         loss = before.redundancy / 2 * float(np.log(after.vPv / before.vPv))
-        seen = int((other.network.camera[other.network.image_points.image] == q).sum())
-        if loss > price_of(saved, seen) + MIN_LEAD:
-            yield ours.name, theirs.model, _sigma_px(after.solution)[0], _sigma_px(before.solution)[0]
+        fits, own = _sigma_px(after.solution)[0], _sigma_px(before.solution)[0]
+        if loss > prices[model] + MIN_LEAD and fits > own:
+            return tuple(replaced), model, fits, own
+    return None
+
+
+def _free_terms(camera: Camera) -> int:
+    """Return the number of free parameters, where one or two focal lengths count as one."""
+    focal = camera.plays(Role.FOCAL)
+    return int(camera.free[~focal].sum()) + bool(camera.free[focal].any())

@@ -114,7 +114,11 @@ def transformed(result: Solution, J: FloatArray, shift: FloatArray, order: IntAr
     n, e = len(order), result.estimate
     Q = result.covariance.reshape(n, 3, n, 3)[order][:, :, order]
     Q = np.einsum("xi,aibj,yj->axby", J, Q, J).reshape(3 * n, 3 * n)
-    estimate = replace(e, points=e.points[order] @ J.T + shift, position=e.position @ J.T + shift)
+    scale = np.cbrt(np.linalg.det(J))
+    rotation = J @ e.rotation / scale if scale > 0 else e.rotation  # a mirrored frame has no photographs
+    estimate = replace(
+        e, points=e.points[order] @ J.T + shift, position=e.position @ J.T + shift, rotation=rotation
+    )
     return replace(
         result, estimate=estimate, covariance=Q, point_covariance=J @ result.point_covariance[order] @ J.T
     )

@@ -7,10 +7,13 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from sfm.adjustment.result import Adjustment
 from sfm.adjustment.solve import adjust
+from sfm.comparison import weaker_solution
+from sfm.comparison.camera_readjustment import adjusted_with
 from sfm.comparison.comparison_remarks import verdict_of_comparison
 from sfm.comparison.significance import compare_results
-from sfm.model.camera import camera_from_values
+from sfm.model.camera import Camera, camera_from_values
 from sfm.model.estimate import Estimate
 from sfm.model.network import Network
 from sfm.model.remarks.remark import of_kind
@@ -54,23 +57,24 @@ def test_a_leaner_lens_and_coarser_image_points_are_named(turned: bool) -> None:
     assert weakness.sigma_px == pytest.approx(0.4, rel=0.5) and weakness.of_sigma_px == pytest.approx(
         0.05, rel=0.1
     )
-    assert weakness.model == "opencv" and weakness.own_px < 0.06 < 0.08 < weakness.with_model_px
-    texts = [said.text for said in of_kind(verdict_of_comparison(comparison).remarks, "weaker_solution")]
-    assert len(texts) == 2
-    assert texts[0].startswith(
-        "model is weaker than survey. The standard deviation of its image points is 0."
+    assert (
+        weakness.model == "opencv without k2, p1, p2"
+        and weakness.own_px < 0.06 < 0.08 < weakness.with_model_px
     )
-    assert texts[1].startswith("model is weaker than survey. Its opencv model is too lean for camera")
+    texts = [said.text for said in of_kind(verdict_of_comparison(comparison).remarks, "weaker_solution")]
+    (text,) = texts
+    assert text.startswith("model is weaker than survey: the standard deviation of its image points is 0.")
+    assert "; its lens model opencv without k2, p1, p2 is too lean for camera " in text
 
 
 def test_residuals_of_a_leaner_lens_do_not_make_its_image_points_coarse() -> None:
     (weakness,) = compare_results(solved("survey", 0.05), solved("model", 0.05, lean=True)).weaker
-    assert weakness.sigma_px is None and weakness.camera is not None
+    assert weakness.sigma_px is None and weakness.cameras
 
 
 def test_coarser_image_points_alone_are_named() -> None:
     (weakness,) = compare_results(solved("survey", 0.1), solved("model", 0.2)).weaker
-    assert weakness.sigma_px == pytest.approx(0.2, rel=0.1) and weakness.camera is None
+    assert weakness.sigma_px == pytest.approx(0.2, rel=0.1) and not weakness.cameras
 
 
 def test_like_solutions_and_solutions_of_other_photographs_have_no_weakness() -> None:
@@ -80,3 +84,30 @@ def test_like_solutions_and_solutions_of_other_photographs_have_no_weakness() ->
         other, network=replace(other.network, images=tuple(f"x{name}" for name in other.network.images))
     )
     assert compare_results(solved("a", 0.1), replace(other, images_named=True), align="points").weaker == ()
+
+
+def test_solutions_without_noise_are_compared() -> None:
+    (weakness,) = compare_results(solved("a", 0.0), solved("b", 0.1)).weaker
+    assert weakness.name == "b" and weakness.of_sigma_px < 0.1 * 0.1
+    (weakness,) = compare_results(solved("a", 0.0), solved("lean", 0.0, lean=True)).weaker
+    assert weakness.name == "lean" and weakness.own_px < weakness.with_model_px
+
+
+def test_cameras_of_one_model_are_adjusted_together(monkeypatch: pytest.MonkeyPatch) -> None:
+    network, truth = scene("weaker")
+    (lens,) = truth.cameras
+    count = len(network.images)
+    cameras = tuple(replace(lens, name=f"{k}") for k in range(count))
+    network = replace(observed_anew(network, truth, 0.05, seed_of("each")), camera=np.arange(count))
+    truth = replace(truth, cameras=cameras)
+    each = replace(Solution("each", network, truth), points_named=True, images_named=True)
+    adjusted = list[int]()
+
+    def counting(solution: Solution, cameras: dict[str, Camera]) -> Adjustment | None:
+        adjusted.append(len(cameras))
+        return adjusted_with(solution, cameras)
+
+    monkeypatch.setattr(weaker_solution, "adjusted_with", counting)
+    (weakness,) = compare_results(each, solved("model", 0.05, lean=True)).weaker
+    assert weakness.cameras == tuple(camera.name for camera in cameras)
+    assert adjusted == [0, count]

@@ -16,10 +16,11 @@ import numpy as np
 
 from sfm.adjustment.covariance import change_datum
 from sfm.adjustment.datum import Datum
+from sfm.comparison.solutions import redundancy_of, robust_sigma_px
 from sfm.judgement.checks import root_mean_square
 from sfm.judgement.survey_result import SurveyResult
 from sfm.model.camera import pixel_from_rays
-from sfm.model.conventions import MAD_TO_SIGMA, METRES, FloatArray, IntArray, angles_from_rotation
+from sfm.model.conventions import METRES, FloatArray, IntArray, angles_from_rotation
 from sfm.model.display import counted, listed
 from sfm.model.errors import GeometryError
 from sfm.model.network import rows_of
@@ -31,10 +32,8 @@ from sfm.products.refining.refinement import free_cameras
 from sfm.survey.inputs.given_values import KnownPoints, Observations, ScaleBar, StartOrientations
 from sfm.survey.inputs.survey import Survey
 
-LEAST_SIGMA_PX = 1e-3  # of image points that a model fits without residuals, as those of a simulation
 MIN_FIXED = 3  # points that a datum needs
 MAX_NAMED = 20  # parts in a note on what is not used
-DATUM = 7  # coordinates, angles and scale that image points do not tell
 
 
 @dataclass(frozen=True)
@@ -66,9 +65,7 @@ class Stated:
     @property
     def sigma_px(self) -> float:
         """Robust standard deviation of a coordinate, px: residuals are smaller, by the root of its share."""
-        share = min(1.0, self.redundancy / self.residuals.size)
-        spread = MAD_TO_SIGMA * float(np.median(np.abs(self.residuals)))
-        return max(spread / float(np.sqrt(share)), LEAST_SIGMA_PX)
+        return robust_sigma_px(self.residuals, self.redundancy)
 
 
 @dataclass(frozen=True)
@@ -133,14 +130,13 @@ def stated_of(model: Solution) -> Stated:
             f"{counted(int(estimate.determined.sum()), 'point')} with coordinates; poses, cameras or points "
             "alone cannot be tested"
         )
-    unknowns = 6 * len(np.unique(seen.image)) + 3 * len(np.unique(seen.point)) - DATUM
     return Stated(
         residuals,
         seen.point[known],
         len(seen) - len(residuals),
         int(estimate.oriented.sum()),
         int(estimate.determined.sum()),
-        max(2 * len(seen) - unknowns, 1),
+        redundancy_of(seen),
     )
 
 

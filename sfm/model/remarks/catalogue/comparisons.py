@@ -128,7 +128,8 @@ ROWS = (
         "error",
         "The points of {first} and {second} differ, and no half of them agrees.",
         "a complex change of the whole object, or standard deviations that are far too small",
-        "Name points that are known to be stable (--reference, --align control).",
+        "Of two results of the same photographs, in which nothing moved, use the one that is not the weaker; "
+        "else name points that are known to be stable (--reference, --align control).",
     ),
     Kind(
         "interior_differs",
@@ -141,9 +142,9 @@ ROWS = (
     Kind(
         "weaker_solution",
         "note",
-        "{weaker} is weaker than {of}. [[The standard deviation of its image points is {theirs}, that of "
-        "{of} {ours}]][[Its {model} model is too lean for camera {camera}: with it, the standard deviation "
-        "of the image points of {of} is {fits} in place of {own}]].",
+        "{weaker} is weaker than {of}[[: the standard deviation of its image points is {theirs}, that of "
+        "{of} {ours}]][[; its lens model {model} is too lean for {cameras:@camera}: with it, the standard "
+        "deviation of the image points of {of} is {fits} in place of {own}]].",
         "photographs, targets or texture that are measured less precisely, or too few terms of distortion",
         "Believe {of}; give {weaker} more precise image points, or a camera model with more terms.",
     ),
