@@ -330,7 +330,7 @@ def test_a_model_whose_halves_are_worse_is_kept(
         refine(tmp_path / "model", tmp_path)
     printed = capsys.readouterr().out
     assert "100 ppm of the distance before, 120 ppm after" in printed
-    assert f"Model: {tmp_path / 'model'}\n" in printed
+    assert f"Model: {tmp_path / 'model'}\n" in printed and "in the files" not in printed
     out = tmp_path / "model_refined"
     assert (out / "refinement.html").is_file() and not list(out.glob("*.bin"))
 
@@ -346,8 +346,11 @@ def test_cameras_are_joined_although_new_key_points_are_not_better(
     with pytest.raises(SystemExit, match="1"):
         refine(tmp_path / "model", tmp_path, one_camera=True)
     out = tmp_path / "model_refined"
-    assert f"Model: {out}\n" in capsys.readouterr().out
+    printed = capsys.readouterr().out
     after = pycolmap.Reconstruction(str(out))
+    count = sum(len(point.track.elements) for point in before.points3D.values())
+    assert f"Model: {out}\n" in printed
+    assert f"in the files  {_rms(after):.4f} px, {count} key points as they came" in printed
     assert len(before.cameras) == 2 and len(after.cameras) == 1
     assert after.num_reg_images() == before.num_reg_images() == PHOTOGRAPHS
     assert after.num_points3D() == before.num_points3D()

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from pathlib import Path
 from typing import Annotated
 
@@ -140,9 +141,10 @@ def refine(
             images=refinement.images,
             points=refinement.points_anew,
         )
-    elif refinement.as_it_came is not None:
+    elif written and refinement.as_it_came is not None:
         keep_key_points(opened, refinement.as_it_came)
-    numbers = Numbers(opened.image_ids, opened.point_ids, interior, *key_points_of(opened))
+    of_files = key_points_of(opened) if written else (0, math.nan)
+    numbers = Numbers(opened.image_ids, opened.point_ids, interior, *of_files)
     print(refinement_text(refinement), end="")
     page = page_of(refinement, numbers=numbers, title=model.resolve().name)
     with whole_folder(out) as folder:
@@ -150,7 +152,8 @@ def refine(
             write_scene(folder, opened.scene)
         for name, text in texts_of(page).items():
             (folder / name).write_text(text, encoding="utf-8")
-    print(describe_key_points(refinement, numbers))
+    if written:
+        print(describe_key_points(refinement, numbers))
     if set(opened.models) <= PINHOLES and not {"cx", "cy"} <= set(names_in(fix)):
         print("cameras       are pinholes, of which some programs read f alone: for these add --fix cx,cy")
     print(f"Model: {out if written else model}")

@@ -34,6 +34,12 @@ class Numbers:
 
 def describe_key_points(refinement: Refinement, numbers: Numbers) -> str:
     """Return the line on the RMS that COLMAP finds in the files, which exceeds the adjusted RMS."""
+    if not refinement.better:
+        as_they_came = counted(numbers.written, "key point")
+        return (
+            f"in the files  {numbers.written_px:.4f} px, {as_they_came} as they came; the tables of standard "
+            "deviations are of those measured anew"
+        )
     kept = numbers.written - refinement.refined
     return (
         f"in the files  {numbers.written_px:.4f} px, including {counted(kept, 'unchanged key point')} of "
@@ -75,14 +81,18 @@ def _changes(refinement: Refinement, numbers: Numbers, unit: str) -> tuple[Part,
     control = ""
     if refinement.adjustment.datum == "control":
         control = ", those after refinement in the datum of the control"
+    in_files = (
+        " The files contain the key points measured anew, and the unchanged key points of points that could "
+        f"not be measured anew in {MIN_RAYS} photographs. COLMAP finds their RMS in the files."
+    )
+    if not refinement.better:
+        in_files = " No file contains the key points measured anew."
     note = Note(
         "Adjusted here: the key points of the model as they came, in an adjustment with inner constraints "
         "and without rejection. Measured anew: by least squares matching with windows of "
         f"{refinement.window_px} px. Points whose windows do not overlap are adjusted; the others are "
         f"intersected afterwards. Standard deviations are in the datum of inner constraints{control}, and "
-        "scaled by sigma0 of the same column. The files contain the key points measured anew, and the "
-        f"unchanged key points of points that could not be measured anew in {MIN_RAYS} photographs. COLMAP "
-        "finds their RMS in the files."
+        "scaled by sigma0 of the same column." + in_files
     )
     return Table(heads, _sizes(refinement, numbers, unit)), note
 
@@ -189,10 +199,19 @@ def _sizes(refinement: Refinement, numbers: Numbers, unit: str) -> list[tuple[ob
         ("Points", len(refinement.points), len(readjusted.network.points), refinement.points_anew.sum()),
         ("Points whose windows do not overlap, adjusted", "", "", refinement.points.sum()),
         ("Key points with a point", refinement.key_points, (~readjusted.rejected).sum(), refinement.refined),
-        ("Key points with a point in the files", refinement.key_points, "", numbers.written),
-        ("of these, unchanged", refinement.key_points, "", numbers.written - refinement.refined),
-        ("RMS of the key points in the files, per coordinate [px]", rms[0], "", rms[3]),
     ]
+    if refinement.better:
+        kept = numbers.written - refinement.refined
+        rows += [
+            ("Key points with a point in the files", refinement.key_points, "", numbers.written),
+            ("of these, unchanged", refinement.key_points, "", kept),
+            ("RMS of the key points in the files, per coordinate [px]", rms[0], "", rms[3]),
+        ]
+    elif numbers.written:
+        rows += [
+            ("Key points with a point in the files", refinement.key_points, numbers.written, ""),
+            ("RMS of the key points in the files, per coordinate [px]", rms[0], rms[3], ""),
+        ]
     return [*rows, ("Targets", "", "", len(refinement.target_points))] if refinement.targets else rows
 
 
