@@ -38,7 +38,7 @@ from sfm.model.arguments import checked_arguments
 from sfm.model.conventions import METRES, BoolArray, FloatArray, IntArray
 from sfm.model.display import html_table, text_table
 from sfm.model.distributions import FALSE_ALARM
-from sfm.model.errors import GeometryError
+from sfm.model.errors import GeometryError, SurveyFileError
 from sfm.model.network import Network
 from sfm.model.remarks.remark import Remark, remark
 from sfm.model.similarity import Similarity, fit_similarity
@@ -289,7 +289,10 @@ def _same_share(a: Network, b: Network, pairing: Pairing) -> float:
 
 
 def _interior(a: Solution, b: Solution, ia: IntArray, ib: IntArray) -> tuple[InteriorDifference, ...]:
-    """Return the differences of cameras with common photographs or the same name, each pair once."""
+    """Return the differences of cameras with common photographs or the same name, each pair once.
+
+    Cameras of B that do not convert to the model of A, such as a fisheye, are left out.
+    """
     differences = []
     pairs = dict.fromkeys(zip(a.network.camera[ia].tolist(), b.network.camera[ib].tolist(), strict=True))
     if a.images_named and b.images_named:
@@ -311,7 +314,10 @@ def _interior(a: Solution, b: Solution, ia: IntArray, ib: IntArray) -> tuple[Int
         if theirs.model != ours.model:
             if not theirs.in_mm:
                 theirs = replace(theirs, pixel_mm=ours.pixel_mm)
-            conversion = convert_camera(theirs, ours.model)
+            try:
+                conversion = convert_camera(theirs, ours.model)
+            except (GeometryError, SurveyFileError):
+                continue
             theirs = conversion.camera
         else:
             known = [

@@ -111,3 +111,24 @@ def test_cameras_of_one_model_are_adjusted_together(monkeypatch: pytest.MonkeyPa
     (weakness,) = compare_results(each, solved("model", 0.05, lean=True)).weaker
     assert weakness.cameras == tuple(camera.name for camera in cameras)
     assert adjusted == [0, count]
+
+
+@pytest.mark.parametrize("turned", [False, True])
+def test_results_whose_lenses_do_not_convert_are_compared(turned: bool) -> None:
+    """A's fisheye was refused as no model to convert to."""
+    survey, other = solved("survey", 0.05), solved("model", 0.05, seed="fisheye")
+    (lens,) = other.estimate.cameras
+    fisheye = camera_from_values(
+        lens.name,
+        "opencv_fisheye",
+        lens.size_px,
+        tuple(lens.pixel_mm.tolist()),
+        c_mm=10.0,
+        free=(),
+        values=(),
+    )
+    other = replace(other, estimate=replace(other.estimate, cameras=(fisheye,)))
+    comparison = compare_results(*((other, survey) if turned else (survey, other)))
+    assert len(comparison.points) == len(survey.network.points)
+    assert all(weakness.cameras == () for weakness in comparison.weaker)
+    assert len(comparison.interior) == (0 if turned else 1)
