@@ -146,7 +146,8 @@ ROWS = (
         "{of} {ours}]][[; its lens model {model} is too lean for {cameras:@camera}: with it, the standard "
         "deviation of the image points of {of} is {fits} in place of {own}]].",
         "photographs, targets or texture that are measured less precisely, or too few terms of distortion",
-        "Believe {of}; give {weaker} more precise image points, or a camera model with more terms.",
+        "Of the same photographs, believe {of}; give {weaker} more precise image points, or a camera model "
+        "with more terms.",
     ),
     Kind(
         "same_image_points",
