@@ -58,7 +58,7 @@ def test_a_reduced_camera_sees_the_same_in_larger_pixels(model: str, shrink: int
 def test_derivatives_equal_differences(model: str) -> None:
     camera = lens(model)
     rng = seed_of(model + " derivatives")
-    share = 1e-5 if model.startswith("splined") else 1e-8  # third derivatives of cubic splines have steps
+    share = 1e-6 if model.startswith("splined") else 1e-8  # third derivatives of cubic splines have steps
     for xy in rng.uniform(100, 1400, (20, 2)):
         uv = tangents_from_pixel(camera, xy[None])[0] + rng.normal(0, 1e-3, 2)
         _, Ju, Jp = residual(camera, camera.parameters, xy, uv)
@@ -71,7 +71,8 @@ def test_derivatives_equal_differences(model: str) -> None:
             assert_derivative(Ju[:, s], steps, h, share)
         others = rng.choice(len(camera.parameters), min(20, len(camera.parameters)), replace=False)
         for s in np.union1d(np.flatnonzero(Jp.any(axis=0)), others):  # of a surface most are 0
-            h = 0.1 / max(np.abs(Jp[:, s]).max(), 100.0)  # moves the residual by 0.1 px at most
+            # moves the residual by 0.1 px at most, and seldom beyond a knot of a spline
+            h = (0.01 if model.startswith("splined") else 0.1) / max(np.abs(Jp[:, s]).max(), 100.0)
             steps = [
                 residual(camera, camera.parameters + f * h * np.eye(len(camera.parameters))[s], xy, uv)[0]
                 for f in (-2, -1, 1, 2)
