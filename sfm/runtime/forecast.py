@@ -23,6 +23,7 @@ OTHERS_APART = math.log(8.0)  # a run of the user is preferred to a typical one 
 # stage is, as others are in work: runs of one kind and two threads (estimates).
 EXPECTED_SIGMA, PARTS_SIGMA = 0.3, 0.7
 LARGEST = 1e6  # of photographs, of 10^6 pixels and of seconds, which no survey reaches
+EXPECTED_WEIGHT = 0.25  # of the expected times, as a share of all stages: runs of fountain-P11 and fox10
 STORED_SHARE = 0.2  # of its expected time, below which a stage read what an earlier run measured
 # How the time of a stage grows with photographs, with the pixels of each, and with given image points, which
 # take the place of photographs. Tie points, windows and the pictures of the report are limited in number, but
@@ -99,7 +100,7 @@ TYPICAL = (
     _typical(Work(("targets",), 21, 3.87), _TARGETS, 3.5, 0.2, 0.4, 7.6, 0.7, 1.6),
     _typical(Work(("targets",), 28, 0.31), _TARGETS, 1.2, 0.1, 0.3, 6.6, 0.4, 1.2),
     _typical(Work(("targets",), 12, 1.92), _TARGETS, 4.3, 0.4, 0.3, 0.3, 0.4, 1.2),
-    _typical(Work(("texture",), 11, 1.57), _TEXTURE, 3.0, 1.3, 16.0, 14.0, 5.0, 9.0),
+    _typical(Work(("texture",), 11, 1.57), _TEXTURE, 3.2, 1.7, 8.8, 8.4, 1.9, 5.9),
     _typical(Work(("texture",), 11, 6.29), _TEXTURE, 7.0, 2.0, 12.0, 8.0, 2.0, 6.0),
     _typical(
         Work(("targets", "texture"), 30, 0.31),
@@ -174,19 +175,22 @@ class RunHistory:
                 part.write_text("".join(f"{line}\n" for line in lines), "utf-8")
 
 
-def slowness(compared: Sequence[tuple[float, float]]) -> float:
+def slowness(compared: Sequence[tuple[float, float]], whole: float = 0.0) -> float:
     """Return how much longer stages take than expected: the geometric mean, weighted by the expected times.
 
-    A stage that found much more to do than usual, such as causes to try, says little of the others.
+    A stage that found much more to do than usual, such as causes to try, says little of the others. So do
+    stages that are a small part of the whole: the expectation has the weight of a quarter of it.
 
     Args:
         compared: time that each stage took, and the expected one, s.
+        whole: expected time of all stages, s.
     """
     rows = [(took, expected) for took, expected in compared if took > 0 and expected > 0]
     of_all = sum(expected for _, expected in rows)
     if not of_all:
         return 1.0
-    return math.exp(sum(expected * math.log(took / expected) for took, expected in rows) / of_all)
+    gained = sum(expected * math.log(took / expected) for took, expected in rows)
+    return math.exp(gained / (of_all + EXPECTED_WEIGHT * whole))
 
 
 @dataclass
@@ -245,7 +249,7 @@ class Countdown:
             return None
         counted = self.counted(stage, elapsed, done, parts)
         if slower is None:
-            slower = slowness(self.compared(stage, counted))
+            slower = slowness(self.compared(stage, counted), sum(self.expected.values()))
         of_stage = counted if counted is not None else slower * self.expected.get(stage, 0.0)
         later = sum(s for name, s in self.expected.items() if name != stage and name not in self.taken)
         return max(at_least, of_stage - elapsed) + slower * later

@@ -53,14 +53,19 @@ def test_what_is_left_follows_the_stages_that_are_finished() -> None:
     countdown = Countdown({"targets": 10.0, "orientation": 4.0, "adjustment": 6.0})
     assert countdown.left("targets", 0.0) == pytest.approx(20.0)
     assert countdown.left("targets", 12.0) == pytest.approx(10.0)  # later than expected
-    assert countdown.left("targets", 5.0, 100, 400) == pytest.approx(15.0 + 20.0, rel=1e-3)  # half as fast
+    # half as fast, and the expectation of a whole of 20 s has the weight of 5 s
+    half = {part: 2.0 ** (part / (part + 5.0)) for part in (10.0, 14.0)}
+    assert countdown.left("targets", 5.0, 100, 400) == pytest.approx(15.0 + 10.0 * half[10.0], rel=1e-3)
     first = countdown.left("targets", 5.0, 1, 4)  # the others may be nearly finished
     assert first is not None and 15.0 < first < 20.0
     countdown.finish("targets", 20.0)
-    assert countdown.left("orientation", 1.0) == pytest.approx(2 * 10.0 - 1.0)
+    assert countdown.left("orientation", 1.0) == pytest.approx(10.0 * half[10.0] - 1.0)
     countdown.finish("orientation", 8.0)
-    assert countdown.left("adjustment", 0.0) == pytest.approx(12.0)
-    assert countdown.left("report", 3.0) == pytest.approx(12.0)  # not expected: nothing is known of it
+    assert countdown.left("adjustment", 0.0) == pytest.approx(6.0 * half[14.0])
+    assert 0.8 * 12.0 < 6.0 * half[14.0] < 12.0  # nearly as on a computer that is half as fast
+    assert countdown.left("report", 3.0) == pytest.approx(
+        6.0 * half[14.0]
+    )  # not expected: nothing is known of it
     assert Countdown().left("targets", 1.0) is None
 
 
