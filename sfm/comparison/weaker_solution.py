@@ -62,24 +62,33 @@ def weaker_solutions(a: Solution, b: Solution, pairing: Pairing) -> tuple[Weakne
     }  # of the common photographs
     if any(a.estimate.cameras[p].size_px != b.estimate.cameras[q].size_px for p, q in cameras):
         return ()  # photographs of another size have other pixels
-    return tuple(
-        weakness
-        for weaker, other, pairs in ((b, a, {(q, p) for p, q in cameras}), (a, b, cameras))
-        if (weakness := _weakness(weaker, other, sorted(pairs))) is not None
+    sigma_a, sigma_b = _sigma_px(a), _sigma_px(b)
+    tried = (
+        _weakness((b, *sigma_b), (a, *sigma_a), sorted((q, p) for p, q in cameras)),
+        _weakness((a, *sigma_a), (b, *sigma_b), sorted(cameras)),
     )
+    return tuple(weakness for weakness in tried if weakness is not None)
 
 
-def _weakness(weaker: Solution, other: Solution, cameras: list[tuple[int, int]]) -> Weakness | None:
-    """Return why a solution is weaker than another one; None if it is not, or not beyond chance."""
-    theirs, freedom = _sigma_px(weaker)
-    ours, of_freedom = _sigma_px(other)
-    lens = _leaner_lens(weaker, other, cameras)
+def _weakness(
+    weaker: tuple[Solution, float, int], other: tuple[Solution, float, int], cameras: list[tuple[int, int]]
+) -> Weakness | None:
+    """Return why a solution is weaker than another one; None if it is not, or not beyond chance.
+
+    Args:
+        weaker: the solution, the standard deviation of its image coordinates, px, and their redundancy.
+        other: the same of the other one.
+        cameras: their cameras of common photographs.
+    """
+    of_weaker, theirs, freedom = weaker
+    of_other, ours, of_freedom = other
+    lens = _leaner_lens(of_weaker, of_other, cameras)
     misfit = 1.0 if lens is None else lens[2] / lens[3]  # the lens alone makes residuals so much larger
     freedoms = (MAD_EFFICIENCY * freedom, MAD_EFFICIENCY * of_freedom)
     coarse = float(f_sf((theirs / (misfit * ours)) ** 2, *freedoms)) < LEVEL
     if lens is None and not coarse:
         return None
-    return Weakness(weaker.name, other.name, theirs if coarse else None, ours, *(lens or ()))
+    return Weakness(of_weaker.name, of_other.name, theirs if coarse else None, ours, *(lens or ()))
 
 
 def _sigma_px(solution: Solution) -> tuple[float, int]:
@@ -120,12 +129,13 @@ def _leaner_lens(
     before = adjusted_with(other, {}) if leaner else None
     if before is None or not before.vPv > 0:
         return None
+    own, _ = _sigma_px(before.solution)
     for model, replaced in leaner.items():
         after = adjusted_with(other, replaced)
         if after is None:
             continue
         loss = before.redundancy / 2 * float(np.log(after.vPv / before.vPv))
-        fits, own = _sigma_px(after.solution)[0], _sigma_px(before.solution)[0]
+        fits, _ = _sigma_px(after.solution)
         if loss > prices[model] + MIN_LEAD and fits > own:
             return tuple(replaced), model, fits, own
     return None

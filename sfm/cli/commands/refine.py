@@ -141,7 +141,7 @@ def refine(
             images=refinement.images,
             points=refinement.points_anew,
         )
-    elif written and refinement.as_it_came is not None:
+    elif written:
         keep_key_points(opened, refinement.as_it_came)
     of_files = key_points_of(opened) if written else (0, math.nan)
     numbers = Numbers(opened.image_ids, opened.point_ids, interior, *of_files)

@@ -7,7 +7,7 @@ adjustment. `free_cameras` chooses the interior parameters that are estimated ag
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 
 import numpy as np
@@ -110,7 +110,7 @@ class Refinement:
     """RMS difference of projection centres of two halves of the points, before and after, relative to the
     distance; see `halves_apart`"""
     like: tuple[LikeCameras, ...] = ()  # cameras that could be one
-    as_it_came: Estimate | None = None  # the whole model, adjusted with its original key points
+    as_it_came: Estimate = field(kw_only=True)  # the whole model, adjusted with its original key points
 
     @property
     def better(self) -> bool:
