@@ -157,7 +157,9 @@ class InteriorObservations(Kind):
         """Return the inverse covariance of all parameters, (p, p); None if they are independent."""
         if self.correlation is None:
             return None
-        return np.asarray(np.linalg.inv(self.correlation) / np.outer(self.sigma, self.sigma))
+        # by its factor the inverse is that of a positive definite matrix, however near to singular
+        root = np.linalg.inv(np.linalg.cholesky(self.correlation)) / self.sigma
+        return np.asarray(root.T @ root)
 
     def weight_of(self, rows: IntArray) -> FloatArray:
         """Return the inverse covariance of the parameters in some rows, (r, r)."""

@@ -1,29 +1,36 @@
 """A splined camera from the image points of another model, for a lens that no parametric model describes.
 
 The distortion starts as that of the adjusted model, as a surface of B-splines over the stereographic plane of
-rays. The image points change it. Without them the change d of the coefficients is normal with mean 0 and
-covariance s^2 K, in which K is the correlation of places a cell of the grid apart. The image points choose s:
-one adjustment with a wide s gives what they know of d, that is N d = n with their normal equations, and
+rays. The image points change it. Without them the change of the coefficients is B p + d: p are changes of
+the parameters of the model, which are free, and d is normal with mean 0 and covariance s^2 K, in which K is
+the correlation of places a cell of the grid apart. A model that is adjusted where there are image points
+therefore says no more elsewhere than its parameters are known beside d. The image points choose s: one
+adjustment with a wide s gives what they know of the coefficients, that is N (B p + d) = n with their normal
+equations. Without p these are N d = n, and
 
     ln p(image points | s) = n' (N + K^-1 / s^2)^-1 n / 2 - ln det(I + s^2 K N) / 2
 
 is largest for the chosen s. It is 0 for s = 0, which is the adjusted model. The sum of
 s^2 K N (I + s^2 K N)^-1 over its diagonal is the number of coefficients that the image points determine.
-Where there are none, the covariance is that before them. The gain of ln likelihood by the surface is, as of
-other models, that of v'Pv, now with the change, minus ln det(I + s^2 K N) / 2. The image points choose the
-grid too: finer ones follow as long as the gain grows.
+Where there are none, the covariance is that before them, with that of the parameters. The gain of ln
+likelihood by the surface is, as of other models, that of v'Pv, now with the change, minus
+ln det(I + s^2 K N) / 2. The image points choose the grid too: finer ones follow as long as the gain grows, or
+stays where they bear a surface. What a grid is too coarse for is in no covariance.
 
 Variances of image points are those of the adjustment with a wide s, sigma0^2 times the stated ones. An
 observation of a coefficient therefore has s / sigma0: after the adjustment its variance is s^2.
 
 Focal lengths and principal point keep their values: the surface has their effects too.
 
-Source: MacKay (1992), Neural Computation 4(3), "Bayesian interpolation" (evidence, determined parameters);
-Kogan (2021), mrcal documentation, "Splined stereographic lens model" (regularised splines).
+Source: Cressie (1993), Statistics for Spatial Data, sec. 3.4 (universal kriging: a trend with unknown
+parameters beside a correlated field); MacKay (1992), Neural Computation 4(3), "Bayesian interpolation"
+(evidence, determined parameters); Kogan (2021), mrcal documentation, "Splined stereographic lens model"
+(regularised splines).
 """
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -44,6 +51,7 @@ from sfm.model.conventions import FloatArray
 from sfm.model.distortion.models import MODELS, Role
 from sfm.model.distortion.splined import KNOTS
 from sfm.model.errors import GeometryError
+from sfm.model.estimate import Estimate
 from sfm.model.observations.control_and_bars import InteriorObservations
 
 PLACES = 41  # along each side of the format, at which the surface is fitted to the adjusted model
@@ -106,7 +114,7 @@ def spline_camera(adjustment: Adjustment, camera: int = 0) -> SplinedCalibration
         except GeometryError as error:
             failed.append(error)
             continue
-        if best is not None and finer.gain <= best.gain + BARE:
+        if best is not None and finer.gain <= best.gain + (-BARE if best.borne else BARE):
             break
         best = finer
     if best is None:
@@ -126,17 +134,25 @@ def _with_knots(adjustment: Adjustment, k: int, knots: int) -> SplinedCalibratio
     start = splined_like(adjustment.estimate.cameras[k], xy, knots)
     pixels = start.parameters[start.plays(Role.FOCAL)].mean()
     K = _correlation(knots)
+    B = _changes(adjustment.estimate.cameras[k], start, xy)
     # sigma0 of the parametric model is too large, which only makes the prior narrower, and is removed again
     sigma = WIDEST_PX / (pixels * adjustment.sigma0)
-    wide = _adjusted(adjustment, k, start, sigma, K)
+    cameras = list(adjustment.estimate.cameras)
+    cameras[k] = start
+    begin = replace(adjustment.estimate, cameras=tuple(cameras))
+    wide = _adjusted(adjustment, k, start, sigma**2 * K, begin)
     sigma0 = wide.sigma0
     d = wide.estimate.cameras[k].parameters[start.free] - start.parameters[start.free]
     known = np.linalg.inv(wide.covariance.interior[k])
     N = known - np.linalg.inv(K) / (sigma0 * sigma) ** 2
+    # what the image points know of the coefficients beside any parameters of the model
+    n, NB = known @ d, N @ B
+    of_model = np.linalg.solve(B.T @ NB + np.eye(B.shape[1]), NB.T)
     sizes = np.geomspace(SMALLEST_PX, WIDEST_PX, STEPS)
-    fit, price, determined = np.transpose([_evidence(N, known @ d, K, size / pixels) for size in sizes])
+    fit, price, determined = _evidence(N - NB @ of_model, n - of_model.T @ (B.T @ n), K, sizes / pixels)
     best = int((fit - price).argmax())
-    final = _adjusted(adjustment, k, start, sizes[best] / (pixels * sigma0), K)
+    expected = ((sizes[best] / pixels) ** 2 * K + B @ B.T) / sigma0**2
+    final = _adjusted(adjustment, k, start, expected, wide.estimate)
     return SplinedCalibration(
         final.estimate.cameras[k],
         final,
@@ -159,14 +175,7 @@ def splined_like(camera: Camera, seen: FloatArray, knots: int) -> Camera:
     Raises:
         GeometryError: too little of the format has rays.
     """
-    width, height = camera.size_px
-    x, y = np.linspace(-0.5, width - 0.5, PLACES), np.linspace(-0.5, height - 0.5, PLACES)
-    xy = np.stack(np.meshgrid(x, y), axis=-1).reshape(-1, 2)
-    xy = np.vstack([xy[within_reach(camera, xy, seen)], seen[:: max(1, len(seen) // PLACES**2)]])
-    rays = rays_from_pixel(camera, xy)
-    rays /= np.linalg.norm(rays, axis=1)[:, None]
-    known = np.isfinite(rays).all(axis=1)
-    xy, rays = xy[known], rays[known]
+    xy, rays = _places(camera, seen)
     if len(xy) < knots**2:
         raise GeometryError(
             f"camera {camera.name}: {len(xy)} places of its format have a ray, needed at least {knots**2} "
@@ -182,14 +191,48 @@ def splined_like(camera: Camera, seen: FloatArray, knots: int) -> Camera:
     p = np.concatenate([values, np.zeros(len(names) - len(values))])
     free = np.arange(len(names)) >= len(values)
     straight = Camera(camera.name, model, camera.size_px, camera.pixel_mm, p, free)
-    # residuals are linear in the coefficients; where the format has no rays, the surface is straight
-    A = parameter_jacobian(straight, rays)[:, :, free].reshape(-1, int(free.sum()))
-    rest = (xy - pixel_from_rays(straight, rays)).ravel()
+    p[free] = _surface(straight, rays, (xy - pixel_from_rays(straight, rays)).reshape(-1, 1))[:, 0]
+    return straight.with_parameters(p)
+
+
+def _places(camera: Camera, seen: FloatArray) -> tuple[FloatArray, FloatArray]:
+    """Return places over the format, px, (k, 2), and the directions of their rays, (k, 3)."""
+    width, height = camera.size_px
+    x, y = np.linspace(-0.5, width - 0.5, PLACES), np.linspace(-0.5, height - 0.5, PLACES)
+    xy = np.stack(np.meshgrid(x, y), axis=-1).reshape(-1, 2)
+    xy = np.vstack([xy[within_reach(camera, xy, seen)], seen[:: max(1, len(seen) // PLACES**2)]])
+    rays = rays_from_pixel(camera, xy)
+    rays /= np.linalg.norm(rays, axis=1)[:, None]
+    known = np.isfinite(rays).all(axis=1)
+    return xy[known], rays[known]
+
+
+def _changes(camera: Camera, start: Camera, seen: FloatArray) -> FloatArray:
+    """Return the changes of a surface that the free parameters of a parametric camera make, (f, q).
+
+    Each is as large as its parameter makes it that shifts the image by WIDEST_PX over the format, RMS.
+    """
+    _, rays = _places(camera, seen)
+    shifts = parameter_jacobian(camera, rays)[:, :, camera.free].reshape(2 * len(rays), -1)
+    shifts *= WIDEST_PX / np.sqrt(2 * (shifts**2).mean(axis=0))
+    return _surface(start, rays, shifts)
+
+
+def _surface(splined: Camera, rays: FloatArray, shifts: FloatArray) -> FloatArray:
+    """Return the coefficients whose surface shifts image points most nearly as given, (f, s).
+
+    Args:
+        splined: camera with a surface; the image points are linear in its coefficients.
+        rays: where shifts are given, camera frame, (k, 3). Where no rays are, the surface is straight.
+        shifts: of both coordinates of each, px, (2 k, s).
+    """
+    free, knots = splined.free, math.isqrt(int(splined.free.sum()) // 2)
+    A = parameter_jacobian(splined, rays)[:, :, free].reshape(-1, int(free.sum()))
     # the second differences of a surface along both axes of its grid
     D, eye = np.diff(np.eye(knots), n=2, axis=0), np.eye(knots)
-    smooth = STRAIGHT * values[0] * np.kron(np.eye(2), np.vstack([np.kron(eye, D), np.kron(D, eye)]))
-    p[free] = np.linalg.solve(A.T @ A + smooth.T @ smooth, A.T @ rest)
-    return straight.with_parameters(p)
+    smooth = np.kron(np.eye(2), np.vstack([np.kron(eye, D), np.kron(D, eye)]))
+    smooth *= STRAIGHT * splined.parameters[splined.plays(Role.FOCAL)][0]
+    return np.asarray(np.linalg.solve(A.T @ A + smooth.T @ smooth, A.T @ shifts))
 
 
 def _correlation(knots: int) -> FloatArray:
@@ -199,46 +242,58 @@ def _correlation(knots: int) -> FloatArray:
     return np.asarray(np.kron(np.eye(2), np.kron(along, along)))
 
 
-def _evidence(N: FloatArray, n: FloatArray, K: FloatArray, size: float) -> tuple[float, float, float]:
-    """Return what ln likelihood gains and loses by a surface, and how many coefficients are determined.
+def _evidence(
+    N: FloatArray, n: FloatArray, K: FloatArray, sizes: FloatArray
+) -> tuple[FloatArray, FloatArray, FloatArray]:
+    """Return what ln likelihood gains and loses by surfaces, and how many coefficients are determined, (s,).
 
     Args:
         N: normal equations of the coefficients by the image points, (f, f).
         n: N times the coefficients that fit the image points, (f,).
         K: correlation of the coefficients, (f, f).
-        size: their standard deviation.
+        sizes: their standard deviations, (s,).
     """
-    L = np.linalg.cholesky(K) * size
+    L = np.linalg.cholesky(K)
     values, vectors = np.linalg.eigh(L.T @ N @ L)
-    values = np.maximum(values, 0.0)
-    along = vectors.T @ (L.T @ n)
-    gained = ((along**2) / (1.0 + values)).sum() / 2
-    return float(gained), float(np.log1p(values).sum() / 2), float((values / (1.0 + values)).sum())
+    along = (vectors.T @ (L.T @ n)) ** 2
+    values = sizes[:, None] ** 2 * np.maximum(values, 0.0)
+    gained = sizes**2 * (along / (1.0 + values)).sum(axis=1) / 2
+    return gained, np.log1p(values).sum(axis=1) / 2, (values / (1.0 + values)).sum(axis=1)
 
 
 def _adjusted(
-    adjustment: Adjustment, k: int, start: Camera, sigma: float, correlation: FloatArray
+    adjustment: Adjustment, k: int, start: Camera, expected: FloatArray, begin: Estimate
 ) -> Adjustment:
-    """Return the adjustment with a splined camera, whose coefficients are expected where they start."""
+    """Return the adjustment with a splined camera, whose coefficients are expected where they start.
+
+    Args:
+        adjustment: with the parametric camera.
+        k: index of the camera.
+        start: the splined camera.
+        expected: covariance of its coefficients before the adjustment, (f, f).
+        begin: estimate with which the iterations begin.
+
+    Raises:
+        GeometryError: the network has no solution.
+    """
+    sigma = np.sqrt(np.diagonal(expected))
     network, kept = adjustment.network, ~adjustment.rejected
     free = np.flatnonzero(start.free)
     before = network.interior.select(network.interior.camera != k)
     count = len(before)
     R = np.eye(count + len(free))
     R[:count, :count] = np.eye(count) if before.correlation is None else before.correlation
-    R[count:, count:] = correlation
+    R[count:, count:] = expected / np.outer(sigma, sigma)
     interior = InteriorObservations(
         np.concatenate([before.camera, np.full(len(free), k)]),
         np.concatenate([before.parameter, free]),
         np.concatenate([before.value, start.parameters[free]]),
-        np.concatenate([before.sigma, np.full(len(free), sigma)]),
+        np.concatenate([before.sigma, sigma]),
         R,
     )
-    cameras = list(adjustment.estimate.cameras)
-    cameras[k] = start
     adjusted = adjust(
         replace(network, image_points=network.image_points.select(kept)).with_given(interior),
-        replace(adjustment.estimate, cameras=tuple(cameras)),
+        begin,
         datum=Datum("control" if adjustment.datum == "control" else "free"),
         reject="none",
         options=AdjustmentOptions(image_sigma_factor=adjustment.image_sigma_factor[kept]),

@@ -43,9 +43,13 @@ def splined(parametric: Adjustment) -> SplinedCalibration:
 
 def errors(camera: Camera, inside: FloatArray, finer: float = 1.0) -> FloatArray:
     """Errors of projection of far points over the format, RMS of both coordinates, after one rotation, px."""
-    rays = rays_from_pixel(CAMERA, GRID)
+    return shifts(camera, rays_from_pixel(CAMERA, GRID), GRID + waves(GRID, finer), inside)
+
+
+def shifts(camera: Camera, rays: FloatArray, expected: FloatArray, inside: FloatArray) -> FloatArray:
+    """Shifts of projections from expected places after one rotation, RMS of both coordinates, px."""
     seen = pixel_from_rays(camera, rays)
-    error = seen - (GRID + waves(GRID, finer))
+    error = seen - expected
     turned = ray_jacobian(camera, seen, rays) @ -skew(rays)
     sound = inside & np.isfinite(turned).all(axis=(1, 2))
     w = np.linalg.lstsq(turned[sound].reshape(-1, 3), error[sound].ravel(), rcond=None)[0]
@@ -110,6 +114,24 @@ def test_the_image_points_choose_the_grid(parametric: Adjustment, splined: Splin
     assert best < min(others)
 
 
+def test_the_surface_is_no_surer_than_the_model_where_there_are_no_image_points() -> None:
+    """Longer waves: the model follows them where image points are, and departs from the lens elsewhere."""
+    ratios = []
+    for finer in (0.35, 0.7):
+        board = strange_board(seed_of(f"long waves {finer}"), photographs=40, finer=finer)
+        start = with_everything_free(board.truth)
+        a = sfm.adjust(noisy(board, seed_of("long noise")), start, datum="control", reject="none")
+        surface = spline_camera(a)
+        inside, far = observed_part(a.network.image_points.xy, GRID)[1], GRID[:, 0] > 1000
+        error, before = (
+            errors(camera, inside, finer)[far] for camera in (surface.camera, a.estimate.cameras[0])
+        )
+        assert np.sqrt((error**2).mean()) < 0.7 * np.sqrt((before**2).mean())
+        sigma = projection_uncertainty(surface.adjustment).sigma_at(GRID, np.inf)[far]
+        ratios.append(np.sqrt(np.mean((error / sigma) ** 2)))
+    assert min(ratios) > 0.4 and max(ratios) < 2.5, ratios
+
+
 @pytest.mark.slow
 def test_shorter_waves_need_a_finer_grid() -> None:
     board = strange_board(seed_of("strange"), photographs=60, finer=2.0)
@@ -143,9 +165,10 @@ def test_a_lens_that_its_model_describes_bears_no_surface() -> None:
     a = sfm.adjust(board.noisy(seed_of("usual noise")), board.truth, datum="control", reject="none")
     usual = spline_camera(a)
     assert not usual.borne and usual.gain < 3
-    moved = pixel_from_rays(usual.camera, rays_from_pixel(a.estimate.cameras[0], GRID)) - GRID
     inside = observed_part(a.network.image_points.xy, GRID)[1]
-    assert np.abs(moved[inside]).max() < 0.1
+    moved = shifts(usual.camera, rays_from_pixel(a.estimate.cameras[0], GRID), GRID, inside)
+    sigma = projection_uncertainty(a).sigma_at(GRID, np.inf)
+    assert moved[inside].max() < 0.1 and (moved[inside] < sigma[inside]).all()
 
 
 @pytest.mark.parametrize("model", ["brown", "opencv_fisheye"])
