@@ -69,7 +69,7 @@ def assemble_result(
         control_check=solution.control_check,
         stage_remarks=(
             *measured.remarks,
-            *remarks_on_contradicting(before),
+            *remarks_on_contradicting(before, measured.network),
             *start.remarks,
             *matched.remarks,
             *solution.remarks,

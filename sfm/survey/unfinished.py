@@ -117,7 +117,7 @@ def unfinished_survey(
         photographs=overlays,
         remarks=(
             *measured.remarks,
-            *remarks_on_contradicting(contradicting),
+            *remarks_on_contradicting(contradicting, measured.network),
             *remarks,
         ),
         settings=settings_by_table(survey),

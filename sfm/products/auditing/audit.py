@@ -181,11 +181,14 @@ def survey_of_model(
         compare={"backend": "none"},  # type: ignore[arg-type]
         control=_control(model),
         scale_bars=_bars(model),
-        observations=Observations.from_arrays(
-            [network.images[i] for i in seen.image],
-            [network.points[j] for j in seen.point],
-            seen.xy,
-            sigma if np.isfinite(sigma).all() else None,
+        observations=replace(
+            Observations.from_arrays(
+                [network.images[i] for i in seen.image],
+                [network.points[j] for j in seen.point],
+                seen.xy,
+                sigma if np.isfinite(sigma).all() else None,
+            ),
+            names_last=model.points_named,
         ),
         start_orientations=StartOrientations.from_arrays(
             [network.images[i] for i in oriented],

@@ -104,7 +104,8 @@ def find_photograph_cameras(
     for i in np.flatnonzero(doubtful).tolist():
         name, before = network.images[i], estimate.cameras[network.camera[i]]
         rows = np.flatnonzero((seen.image == i) & known)
-        fit = _photograph_camera(network, estimate, i, rows, sigma_px, false_alarm)
+        has_others = (network.camera == network.camera[i]).sum() > 1  # else the camera is its own already
+        fit = _photograph_camera(network, estimate, i, rows, sigma_px, false_alarm) if has_others else None
         if fit is None:
             out[i] = lost[i]
             if lost[i] and oriented[i]:

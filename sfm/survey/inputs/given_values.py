@@ -163,6 +163,7 @@ class Observations:
     table: CsvTable  # their table, for error messages
     covariance: FloatArray | None = None  # of x and y in the square of the unit, 0 if None, (k,)
     sigma_px: float | None = None  # of rows without standard deviations; None: that of the survey
+    names_last: bool = True  # whether points keep their names, or are matches that are numbered anew
     of_control: bool = False  # whether control has them, whose photographs may not be those of the survey
 
     def __len__(self) -> int:

@@ -174,12 +174,15 @@ class Measurements:
         return FailedImage(image, reason)
 
 
-def remarks_on_contradicting(left_out: Sequence[LeftOutPoint]) -> tuple[Remark, ...]:
+def remarks_on_contradicting(left_out: Sequence[LeftOutPoint], network: Network) -> tuple[Remark, ...]:
     """Return the one remark on image points that contradict one another, whatever found them.
 
     Args:
         left_out: image points that are not used, each with its reason.
+        network: that of the survey. Where no point keeps its name in later runs, nobody can correct one.
     """
+    if not network.named.any():
+        return ()
     kind = "image_points_contradicting"
     names = [point.point for point in left_out if point.reason.kind == kind]
     return (remark(kind, image_points=names),) if names else ()

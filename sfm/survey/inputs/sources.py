@@ -21,6 +21,8 @@ S = TypeVar("S", bound="DataclassInstance")
 MIN_TIE_POINTS = 15
 TARGETS = Source("targets", noun="the targets")
 GIVEN = Source("given", noun="the given image points", is_exact=True, points="given")
+# tracks of another program: its points are matched, and numbered anew by every run
+MATCHES = replace(GIVEN, noun="the matches", names_last=False, is_matched=True)
 MARKS = Source("marks", noun="the named points", is_matched=True, points="named")
 TEXTURE = Source(
     "texture",
@@ -86,6 +88,12 @@ def declared(survey: Any) -> tuple[Declared, ...]:
     if not stated or (without_photographs and all(camera.images for camera in survey.cameras)):
         stated = (ROWS[0], *stated)  # image points beside photographs orient them for targets without codes
     return alone[:1] or stated
+
+
+def stated_sources(survey: Any) -> tuple[Source, ...]:
+    """Return what the adjustment must know of the sources of the image points of a survey."""
+    of_matches = any(not table.names_last for table in given_tables(survey))
+    return tuple(MATCHES if of_matches and row.source is GIVEN else row.source for row in declared(survey))
 
 
 def tables_of(given: Any) -> tuple[Any, ...]:

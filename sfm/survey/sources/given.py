@@ -133,6 +133,8 @@ def read_tables(survey: Survey, tables: tuple[Observations, ...], files: Photogr
         reason = remark("image_points_contradicting", image_points=name)
         left_out.append(LeftOutPoint(name, times[i, j], reason))
     left_out += [LeftOutPoint(name, 1, remark("image_points_outside", image_points=name)) for name in gross]
+    # nobody can correct matches that are numbered anew
+    repeated = merged.remarks(images, points) if all(table.names_last for table in tables) else ()
     outside_remark = (remark("image_points_outside", image_points=gross),) if gross else ()
     return Measurements(
         network,
@@ -141,7 +143,7 @@ def read_tables(survey: Survey, tables: tuple[Observations, ...], files: Photogr
         np.full(len(points), MIN_RAYS),
         failed,
         _overlays(network, files, readable),
-        remarks=(*offsets, *merged.remarks(images, points), *outside_remark),
+        remarks=(*offsets, *repeated, *outside_remark),
         left_out=tuple(left_out),
     )
 

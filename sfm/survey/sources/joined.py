@@ -32,7 +32,7 @@ from sfm.photographs.reading import decoding_once
 from sfm.runtime.progress import Progress, StageClock
 from sfm.survey.inputs.measurements import NO_NAMES, Measurements, Naming, PhotographList
 from sfm.survey.inputs.settings import AdjustSettings
-from sfm.survey.inputs.sources import Declared, declared
+from sfm.survey.inputs.sources import Declared, declared, stated_sources
 from sfm.survey.inputs.start import network_of, scale_bars
 from sfm.survey.inputs.survey import Survey
 from sfm.survey.inputs.survey_file import SurveyFile
@@ -179,7 +179,7 @@ def _joined_measurements(survey: Survey, parts: Sequence[Measurements]) -> Measu
 
 
 def _of_one_source(survey: Survey, network: Network) -> Network:
-    return replace(network, sources=tuple(row.source for row in declared(survey)))
+    return replace(network, sources=stated_sources(survey))
 
 
 def _not_refused(survey: Survey, part: Measurements | Correspondences) -> BoolArray:
@@ -322,7 +322,7 @@ def _joined(
     named: names that the points of each network had before running names were changed.
     used: which image points of each network take part.
     """
-    sources = tuple(row.source for row in declared(survey))
+    sources = stated_sources(survey)
     images = tuple(dict.fromkeys(name for network in networks for name in network.images))
     points = tuple(dict.fromkeys(name for network in networks for name in network.points))
     camera = np.zeros(len(images), dtype=np.int64)

@@ -13,9 +13,10 @@ from adapters.formats.content import Content
 from adapters.formats.registry import read_comparable, write_any, write_content
 from sfm.adjustment.quality.correlations import OrientationCorrelation
 from sfm.model.camera import pixel_from_rays
+from sfm.model.conventions import FloatArray
 from sfm.model.errors import GeometryError
 from sfm.model.estimate import Estimate
-from sfm.model.network import Network
+from sfm.model.network import ImagePoints, Network
 from sfm.model.observations.control_and_bars import ObjectPoints
 from sfm.model.similarity import fit_similarity
 from sfm.model.solution import Solution
@@ -102,6 +103,40 @@ def test_gross_errors_of_a_model_are_named() -> None:
     assert {(images[i], points[j]) for i, j in zip(rejected.image, rejected.point, strict=True)} == {
         (network.images[seen.image[k]], network.points[seen.point[k]]) for k in wrong
     }
+
+
+@pytest.mark.parametrize("named", [True, False])
+def test_matches_without_names_are_natural_points(named: bool) -> None:
+    """Points moved from a photograph on; without lasting names they are tracks of two spots of the object."""
+    network, truth = make_network(
+        seed_of("tracks"), images=10, points=120, noise_px=NOISE_PX, model="opencv", free=()
+    )
+    seen = network.image_points
+    later = np.flatnonzero((seen.image >= 5) & np.isin(seen.point, (3, 30)))
+    elsewhere = replace(truth, points=truth.points + 0.01)
+    moved = np.array([pixel_of(elsewhere, network, k) - pixel_of(truth, network, k) for k in later])
+    xy = seen.xy.copy()
+    xy[later] += moved
+    twice = np.flatnonzero(seen.image == 2)[:1]  # two key points of one photograph in a track
+    again = replace(seen.select(twice), xy=xy[twice] + 40.0)
+    network = replace(network, image_points=ImagePoints.joined([replace(seen, xy=xy), again]))
+    model = replace(of_each_photograph(network, truth), points_named=named)
+    stated = stated_of(model)
+    audit = audit_of(model, stated, run_survey(survey_of_model(model, stated)[0]))
+    kinds = [said.kind for said in audit.result.verdict.remarks]
+    assert ("image_points_contradicting" in kinds) == named and "camera_per_photograph" not in kinds
+    assert kinds.count("points_moved") == named and kinds.count("windows_elsewhere") == (not named), kinds
+    (left_out,) = [
+        point for point in audit.result.left_out if point.reason.kind == "image_points_contradicting"
+    ]
+    assert left_out.image_points == 2
+
+
+def pixel_of(estimate: Estimate, network: Network, k: int) -> FloatArray:
+    """Where the camera of an image point images its object point, px, (2,)."""
+    i, j = network.image_points.image[k], network.image_points.point[k]
+    ray = (estimate.points[j] - estimate.position[i]) @ estimate.rotation[i]
+    return np.asarray(pixel_from_rays(estimate.cameras[network.camera[i]], ray[None])[0])
 
 
 def test_a_survey_gives_scale_to_a_model() -> None:

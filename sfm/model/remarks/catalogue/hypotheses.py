@@ -247,11 +247,11 @@ ROWS: tuple[Kind, ...] = (
     Kind(
         "windows_elsewhere",
         Grade("shift", warning=HARMLESS_SIGMAS),  # of these points alone
-        "From {from} on, the windows of {points:point} show a different spot, up to {distance} away, "
+        "From {from} on, {points:natural point} {points:shows|show} a different spot, up to {distance} away, "
         f"{{shift}} standard deviations: {{points}}.{INSTEAD}",
-        "an edge in front of another surface, shine, shadows, or something that moved",
+        "wrong matches, an edge in front of another surface, shine, shadows, or something that moved",
         "Do not use {points:this point|these points}; photographs at smaller steps produce fewer of them.",
-        short="windows that show a different spot",
+        short="natural points that show a different spot",
     ),
     Kind(
         "calibrated_from_few",
