@@ -129,9 +129,14 @@ def refine(
             targets=targets,
             progress=progress,
         )
-    a = refinement.adjustment
-    interior = interior_rows(opened, refinement.start, refinement.estimate, a.covariance.interior)
     written = refinement.better or one_camera  # cameras that were joined are in no model so far
+    of_new = refinement.better or not written
+    after, a = (
+        (refinement.estimate, refinement.adjustment)
+        if of_new
+        else (refinement.as_it_came, refinement.readjusted)
+    )
+    interior = interior_rows(opened, refinement.start, after, a.covariance.interior)
     if refinement.better:
         update_model(
             opened,

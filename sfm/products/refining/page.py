@@ -37,8 +37,8 @@ def describe_key_points(refinement: Refinement, numbers: Numbers) -> str:
     if not refinement.better:
         as_they_came = counted(numbers.written, "key point")
         return (
-            f"in the files  {numbers.written_px:.4f} px, {as_they_came} as they came; the tables of standard "
-            "deviations are of those measured anew"
+            f"in the files  {numbers.written_px:.4f} px, {as_they_came} as they came; sigma_cameras.csv is "
+            "of these, sigma_images.csv and sigma_points.csv of those measured anew"
         )
     kept = numbers.written - refinement.refined
     return (
@@ -156,10 +156,11 @@ def _cameras(refinement: Refinement, numbers: Numbers) -> tuple[Part, ...]:
         (camera, model, f"{name}{unit[str(name)]}", name, *values)
         for camera, model, name, *values in numbers.interior
     ]
+    own = "" if refinement.better or not numbers.written else "After: by the key points in the files. "
     note = Note(
-        "COLMAP's parameters, with pixel coordinates from the corner of the photograph. Held: not estimated, "
-        "because of --fix, because it was 0, or as cx or cy of a camera with few photographs. Sigma: one "
-        "standard deviation."
+        f"{own}COLMAP's parameters, with pixel coordinates from the corner of the photograph. Held: not "
+        "estimated, because of --fix, because it was 0, or as cx or cy of a camera with few photographs. "
+        "Sigma: one standard deviation."
     )
     return Table(heads, rows, "sigma_cameras"), note
 
