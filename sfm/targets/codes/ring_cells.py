@@ -6,7 +6,7 @@ import math
 
 import numpy as np
 
-from sfm.model.conventions import AnyArray, FloatArray
+from sfm.model.conventions import AnyArray, FloatArray, IntArray
 from sfm.runtime.compiling import compiled
 from sfm.runtime.sampling import bilinear
 from sfm.runtime.small_algebra import invert_symmetric
@@ -17,6 +17,7 @@ SAMPLES, PHASES = 12, 12
 # and ring, as a fraction of the way from the dot, and behind the ring, as a fraction of the width.
 IN_RING = (0.3, 0.5, 0.7)
 IN_GAP, BEHIND = 0.5, 1.4
+ALL_ROWS = len(IN_RING) + 2
 # Interpolation between pixels blurs by this variance, px^2 (mean of f (1 - f), f uniform).
 INTERPOLATION = 1 / 6
 # Sigmas in units of the step to the dot, for judging the position of the cells: of the residuals of the
@@ -35,6 +36,7 @@ _SPREAD_SIGMA, _GLOW_SIGMA, _BLUR_SIGMA = 0.05, 0.3, 0.25
 # First steps of the search for the position of the first cell (in cells), spread, glow and ln blur. Steps are
 # halved when none improves the fit, at most _HALVINGS times; the search ends after _ROUNDS rounds.
 _STEP_PLACE, _STEP_SPREAD, _STEP_GLOW, _STEP_BLUR, _HALVINGS, _ROUNDS = 1 / 24, 0.03, 0.3, 0.15, 4, 24
+_PLACE, _SPREAD, _GLOW = 0, 1, 2  # of these four quantities
 _FIRST_STEPS = (_STEP_PLACE, _STEP_SPREAD, _STEP_GLOW, _STEP_BLUR)
 _SIGMAS = np.array([_SPREAD_SIGMA, _GLOW_SIGMA, _BLUR_SIGMA])
 # Rows of the result after the levels.
@@ -75,23 +77,19 @@ def place_cells(
     """
     m = cells * SAMPLES
     out, start = np.full((len(xy), ROWS, cells), math.nan), np.full((len(xy), 2 + cells), math.nan)
-    samples = np.empty((len(IN_RING) + 2, m))
-    sigma, ring_part = np.empty(m), np.empty((len(IN_RING) + 2, m))
-    dot_part = np.empty((len(IN_RING) + 2, m))
-    W, N = np.empty((m, cells)), np.empty((cells, cells))
+    circle, samples = _circle(m), np.empty((ALL_ROWS, m))
+    sigma, ring_part, dot_part = np.empty(m), np.empty((ALL_ROWS, m)), np.empty((ALL_ROWS, m))
+    first, W, N = np.empty((m, 2), dtype=np.int64), np.empty((m, cells)), np.empty((cells, cells))
     c, best_c = np.empty((len(IN_RING), cells)), np.empty((len(IN_RING), cells))
     nothing = np.zeros((2, cells))
     for k in range(len(xy)):
-        is_inside = _sample(
-            image, xy[k], shape[k], levels[k], blur[k], 0.0, inner, outer, tilt[k],
-            samples, sigma, ring_part, dot_part,
-        )  # fmt: skip
-        if not is_inside:
+        if not _sample(image, xy[k], shape[k], levels[k], inner, outer, tilt[k], circle, ALL_ROWS, samples):
             continue
+        _parts(shape[k], blur[k], 0.0, inner, outer, circle, ALL_ROWS, sigma, ring_part, dot_part)
         least, place = math.inf, 0.0
         for phase in range(PHASES):
-            _mixture(sigma, phase / PHASES, nothing, W)
-            cost = _solve(samples, ring_part, dot_part, W, N, c)
+            _mixture(sigma, phase / PHASES, nothing, first, W)
+            cost = _solve(samples, ring_part, dot_part, first, W, N, c)
             if cost < least:
                 least, place = cost, phase / PHASES
                 best_c[:] = c
@@ -99,9 +97,9 @@ def place_cells(
             continue
         start[k, 0], start[k, 1] = least, place
         start[k, 2:] = _two_levels(best_c)[0]
-        _mixture(sigma, place, nothing, W)
-        _solve(samples, ring_part, dot_part, W, N, c)
-        _compare(samples, ring_part, dot_part, W, N, c, out[k])
+        _mixture(sigma, place, nothing, first, W)
+        _solve(samples, ring_part, dot_part, first, W, N, c)
+        _compare(samples, ring_part, dot_part, first, W, N, c, out[k])
         out[k, SPREAD] = 0.0
     return out, start
 
@@ -142,19 +140,23 @@ def fit_cells(
         ring before the cell and behind it; sigma of the level for residuals of 1; and the spread of the ink
         in radii of the dot; (k, 8, cells).
     """
-    m = cells * SAMPLES
+    m, rings = cells * SAMPLES, len(IN_RING)
     out = np.full((len(xy), ROWS, cells), math.nan)
-    samples = np.empty((len(IN_RING) + 2, m))
-    sigma, ring_part = np.empty(m), np.empty((len(IN_RING) + 2, m))
-    dot_part = np.empty((len(IN_RING) + 2, m))
-    W, N = np.empty((m, cells)), np.empty((cells, cells))
-    c = np.empty((len(IN_RING), cells))
+    # of the best values so far, and of those that are tried
+    samples, new_samples = np.empty((ALL_ROWS, m)), np.empty((ALL_ROWS, m))
+    sigma, ring_part, dot_part = np.empty(m), np.empty((ALL_ROWS, m)), np.empty((ALL_ROWS, m))
+    new_sigma, new_ring_part, new_dot_part = np.empty(m), np.empty((ALL_ROWS, m)), np.empty((ALL_ROWS, m))
+    circle, first = _circle(m), np.empty((m, 2), dtype=np.int64)
+    W, N, c = np.empty((m, cells)), np.empty((cells, cells)), np.empty((rings, cells))
     for k in range(len(xy)):
         if math.isnan(start[k, 0]):
             continue
         least, bits = start[k, 0], start[k, 2:]
         # position, spread, glow, ln of the blur over that of the dot
         best, steps = np.array([start[k, 1], 0.0, 0.0, 0.0]), np.array(_FIRST_STEPS)
+        if not _sample(image, xy[k], shape[k], levels[k], inner, outer, tilt[k], circle, rings, samples):
+            continue
+        _parts(shape[k], blur[k], 0.0, inner, outer, circle, rings, sigma, ring_part, dot_part)
         halved = 0
         for _ in range(_ROUNDS):
             before = least
@@ -164,69 +166,53 @@ def fit_cells(
                     tried[parameter] += sign * steps[parameter]
                     if abs(tried[1]) > MAX_SPREAD or abs(tried[2]) > _largest_glow(shape[k]):
                         continue
-                    is_inside = _model(
-                        image, xy[k], shape[k], levels[k], blur[k], inner, outer, tilt[k], bits, tried,
-                        samples, sigma, ring_part, dot_part, W,
-                    )  # fmt: skip
-                    if not is_inside:
+                    s = blur[k] * math.exp(tried[3])
+                    near, far = _spread_ring(inner, outer, tried[1])
+                    without = _without_glow(shape[k], tried[2])
+                    moves, blurs = parameter in (_SPREAD, _GLOW), parameter != _PLACE
+                    if moves and not _sample(
+                        image, xy[k], without, levels[k], near, far, tilt[k], circle, rings, new_samples
+                    ):
                         continue
-                    cost = _solve(samples, ring_part, dot_part, W, N, c)
+                    if blurs:
+                        _parts(
+                            without, s, tried[2], near, far, circle, rings,
+                            new_sigma, new_ring_part, new_dot_part,
+                        )  # fmt: skip
+                    shifts = _shifts(bits, tried[1], tried[2] / s, near, far)
+                    _mixture(new_sigma if blurs else sigma, tried[0], shifts, first, W)
+                    cost = _solve(
+                        new_samples if moves else samples,
+                        new_ring_part if blurs else ring_part,
+                        new_dot_part if blurs else dot_part,
+                        first, W, N, c,
+                    )  # fmt: skip
                     cost += _SAMPLE_SIGMA**2 * ((tried[1:] / _SIGMAS) ** 2).sum()
                     if cost < least:
                         least = cost
                         best[:] = tried
+                        if moves:
+                            samples, new_samples = new_samples, samples
+                        if blurs:
+                            sigma, new_sigma = new_sigma, sigma
+                            ring_part, new_ring_part = new_ring_part, ring_part
+                            dot_part, new_dot_part = new_dot_part, dot_part
                         break
             if least == before:
                 halved += 1
                 if halved == _HALVINGS:
                     break
                 steps /= 2
-        is_inside = _model(
-            image, xy[k], shape[k], levels[k], blur[k], inner, outer, tilt[k], bits, best,
-            samples, sigma, ring_part, dot_part, W,
-        )  # fmt: skip
-        if not is_inside:
+        s, (near, far) = blur[k] * math.exp(best[3]), _spread_ring(inner, outer, best[1])
+        without = _without_glow(shape[k], best[2])
+        if not _sample(image, xy[k], without, levels[k], near, far, tilt[k], circle, ALL_ROWS, samples):
             continue
-        if _solve(samples, ring_part, dot_part, W, N, c) < math.inf:
-            _compare(samples, ring_part, dot_part, W, N, c, out[k])
+        _parts(without, s, best[2], near, far, circle, ALL_ROWS, sigma, ring_part, dot_part)
+        _mixture(sigma, best[0], _shifts(bits, best[1], best[2] / s, near, far), first, W)
+        if _solve(samples, ring_part, dot_part, first, W, N, c) < math.inf:
+            _compare(samples, ring_part, dot_part, first, W, N, c, out[k])
             out[k, SPREAD] = best[1]
     return out
-
-
-@compiled
-def _model(
-    image: AnyArray,
-    xy: FloatArray,
-    shape: FloatArray,
-    levels: FloatArray,
-    blur: float,
-    inner: float,
-    outer: float,
-    tilt: FloatArray,
-    bits: FloatArray,
-    ring: FloatArray,
-    samples: FloatArray,
-    sigma: FloatArray,
-    ring_part: FloatArray,
-    dot_part: FloatArray,
-    W: FloatArray,
-) -> bool:
-    """Fill the samples of a ring and the contributions of its cells; False if the photograph cuts the ring.
-
-    `ring` contains the position of the first cell, spread, glow, and ln of the blur over that of the dot;
-    `bits` is 1.0 for set cells. The other arguments are those of `fit_cells` for one dot, and of `_sample`
-    and `_mixture`.
-    """
-    s = blur * math.exp(ring[3])
-    near, far = _spread_ring(inner, outer, ring[1])
-    without = _without_glow(shape, ring[2])
-    is_inside = _sample(
-        image, xy, without, levels, s, ring[2], near, far, tilt, samples, sigma, ring_part, dot_part
-    )  # fmt: skip
-    if not is_inside:
-        return False
-    _mixture(sigma, ring[0], _shifts(bits, ring[1], ring[2] / s, near, far), W)
-    return True
 
 
 @compiled
@@ -280,6 +266,7 @@ def _solve(
     samples: FloatArray,
     ring_part: FloatArray,
     dot_part: FloatArray,
+    first: IntArray,
     W: FloatArray,
     N: FloatArray,
     c: FloatArray,
@@ -287,34 +274,42 @@ def _solve(
     """Write the least squares levels of the cells and their cofactors, and return their cost.
 
     The cost is the sum of squares of the residuals and of the scatter of the levels; infinite if singular.
+    The other arguments are those of `_mixture`.
     """
     m, cells = W.shape
-    g = np.empty(cells)
+    g, level = np.empty(cells), np.empty(m)
     N[:] = 0.0
     for i in range(m):
-        for a in range(cells):
-            if W[i, a] != 0.0:
-                for b in range(a + 1):
-                    N[a, b] += W[i, a] * W[i, b]
+        for j in range(first[i, 1]):
+            a = _cell(first[i, 0] + j, cells)
+            for k in range(j + 1):
+                b = _cell(first[i, 0] + k, cells)
+                N[max(a, b), min(a, b)] += W[i, j] * W[i, k]
     if not invert_symmetric(N):
         return math.inf
     squares = 0.0
     for row in range(len(IN_RING)):
         g[:] = 0.0
         for i in range(m):
-            v = (samples[row, i] - dot_part[row, i]) / ring_part[row, i]
-            for a in range(cells):
-                g[a] += W[i, a] * v
+            level[i] = (samples[row, i] - dot_part[row, i]) / ring_part[row, i]
+            for j in range(first[i, 1]):
+                g[_cell(first[i, 0] + j, cells)] += W[i, j] * level[i]
         for a in range(cells):
             c[row, a] = 0.0
             for b in range(cells):
                 c[row, a] += N[a, b] * g[b]
         for i in range(m):
-            v = (samples[row, i] - dot_part[row, i]) / ring_part[row, i]
-            for a in range(cells):
-                v -= W[i, a] * c[row, a]
+            v = level[i]
+            for j in range(first[i, 1]):
+                v -= W[i, j] * c[row, _cell(first[i, 0] + j, cells)]
             squares += v * v
     return squares + (_SAMPLE_SIGMA / _CELL_SIGMA) ** 2 * _scatter(c)
+
+
+@compiled
+def _cell(a: int, cells: int) -> int:
+    """Return the number of a cell that is counted on beyond a whole turn."""
+    return a - cells if a >= cells else a
 
 
 @compiled
@@ -355,78 +350,122 @@ def _phi(t: float) -> float:
 
 
 @compiled
+def _circle(m: int) -> FloatArray:
+    """Return cosine and sine of m directions, clockwise in the image as y is down, (m, 2)."""
+    t = 2 * math.pi * np.arange(m) / m
+    return np.stack((np.cos(t), np.sin(t)), axis=1)
+
+
+@compiled
 def _sample(
     image: AnyArray,
     xy: FloatArray,
     shape: FloatArray,
     levels: FloatArray,
-    blur: float,
-    glow: float,
     inner: float,
     outer: float,
     tilt: FloatArray,
+    circle: FloatArray,
+    rows: int,
     samples: FloatArray,
-    sigma: FloatArray,
-    ring_part: FloatArray,
-    dot_part: FloatArray,
 ) -> bool:
-    """Sample the rings, and write the parts of ring and dot in each sample and the blur of cell ends, rad."""
+    """Sample the first rows: rings, the clear ring, and behind; False if the photograph cuts the ring."""
     h, w = image.shape
     p, q, r = shape[0], shape[1], shape[2]
     det = p * r - q * q
-    s = math.sqrt(blur * blur + INTERPOLATION)
-    m = samples.shape[1]
-    middle = (inner + outer) / 2
-    for i in range(m):
-        t = 2 * math.pi * i / m  # y is down, so growing angles run clockwise in the image
-        u, v = math.cos(t), math.sin(t)
+    for i in range(len(circle)):
+        u, v = circle[i, 0], circle[i, 1]
         ex, ey = (r * u - q * v) / det, (p * v - q * u) / det
-        # Ends of cells lie along e; a turn by dt moves the sample by rho dt / (det |e|) across them.
-        sigma[i] = s * det * math.hypot(ex, ey) / middle
-        steepness = math.hypot(p * u + q * v, q * u + r * v)  # |grad rho|
-        for row in range(samples.shape[0]):
-            if row < len(IN_RING):
-                rho = inner + IN_RING[row] * (outer - inner)
-            elif row == len(IN_RING):
-                rho = 1 + IN_GAP * (inner - 1)
-            else:
-                rho = inner + BEHIND * (outer - inner)
-            seen = rho * (1 + (tilt[0] * u + tilt[1] * v) * rho)
+        away = tilt[0] * u + tilt[1] * v
+        for row in range(rows):
+            rho = _radius(row, inner, outer)
+            seen = rho * (1 + away * rho)
             x, y = xy[0] + seen * ex, xy[1] + seen * ey
-            if not (x >= 0 and y >= 0 and x < w - 1 and y < h - 1):
-                if row <= len(IN_RING):
-                    return False
-                samples[row, i] = math.nan
-            else:
+            if x >= 0 and y >= 0 and x < w - 1 and y < h - 1:
                 samples[row, i] = (bilinear(image, x, y) - levels[0]) / levels[1]
-            f, more = 1 / (steepness * s), glow / s
-            ring_part[row, i] = _phi((rho - inner) * f + more) - _phi((rho - outer) * f - more)
-            dot_part[row, i] = _phi((1 - rho) * f + more)
+            elif row <= len(IN_RING):
+                return False
+            else:
+                samples[row, i] = math.nan
     return True
 
 
 @compiled
-def _mixture(sigma: FloatArray, phase: float, shift: FloatArray, W: FloatArray) -> None:
-    """Write the part of each cell in each sample.
+def _radius(row: int, inner: float, outer: float) -> float:
+    """Return the radius of a row of samples, in radii of the dot."""
+    if row < len(IN_RING):
+        return inner + IN_RING[row] * (outer - inner)
+    if row == len(IN_RING):
+        return 1 + IN_GAP * (inner - 1)
+    return inner + BEHIND * (outer - inner)
+
+
+@compiled
+def _parts(
+    shape: FloatArray,
+    blur: float,
+    glow: float,
+    inner: float,
+    outer: float,
+    circle: FloatArray,
+    rows: int,
+    sigma: FloatArray,
+    ring_part: FloatArray,
+    dot_part: FloatArray,
+) -> None:
+    """Write the parts of ring and dot in each sample of the first rows, and the blur of cell ends, rad.
+
+    Opposite samples have the same.
+    """
+    p, q, r = shape[0], shape[1], shape[2]
+    det = p * r - q * q
+    s = math.sqrt(blur * blur + INTERPOLATION)
+    half, middle, more = len(circle) // 2, (inner + outer) / 2, glow / s
+    for i in range(half):
+        u, v = circle[i, 0], circle[i, 1]
+        ex, ey = (r * u - q * v) / det, (p * v - q * u) / det
+        # Ends of cells lie along e; a turn by dt moves the sample by rho dt / (det |e|) across them.
+        sigma[i] = sigma[half + i] = s * det * math.hypot(ex, ey) / middle
+        f = 1 / (math.hypot(p * u + q * v, q * u + r * v) * s)  # 1 / (|grad rho| s)
+        for row in range(rows):
+            rho = _radius(row, inner, outer)
+            of_ring = _phi((rho - inner) * f + more) - _phi((rho - outer) * f - more)
+            ring_part[row, i] = ring_part[row, half + i] = of_ring
+            dot_part[row, i] = dot_part[row, half + i] = _phi((1 - rho) * f + more)
+
+
+@compiled
+def _mixture(sigma: FloatArray, phase: float, shift: FloatArray, first: IntArray, W: FloatArray) -> None:
+    """Write the parts of the cells in each sample, of those that are not zero.
 
     Args:
         sigma: blur of a cell end at each sample, rad, (m,).
         phase: start of the first cell, in cells.
         shift: shift of the start of each cell from its nominal position, see `_shifts`, (2, cells).
-        W: parts, (m, cells).
+        first: receives the first cell that is in each sample, and the number of cells from there on, (m, 2).
+        W: receives the parts of these cells, (m, cells).
     """
     m, cells = W.shape
     width = 2 * math.pi / cells
     for i in range(m):
-        position = i / SAMPLES - phase
-        for a in range(cells):
-            away = (
-                position - a - 0.5 + cells / 2
-            ) % cells - cells / 2  # from the middle of the cell, in cells
-            end = (a + 1) % cells
-            near = (away - 0.5 - shift[0, end]) * width / sigma[i] - shift[1, end]
-            far = (away + 0.5 - shift[0, a]) * width / sigma[i] - shift[1, a]
-            W[i, a] = _phi(far) - _phi(near) if near < 4 and far > -4 else 0.0
+        position, scale = i / SAMPLES - phase, width / sigma[i]
+        reach = min(int(4 / scale + 2), (cells - 1) // 2)
+        a = math.floor(position) - reach
+        start = a % cells
+        far = (position - a - shift[0, start]) * scale - shift[1, start]
+        before, count = _phi(far), 0
+        for _ in range(2 * reach + 1):
+            a += 1
+            end = _cell(start + 1, cells)
+            near = (position - a - shift[0, end]) * scale - shift[1, end]
+            after = _phi(near)
+            if near < 4 and far > -4:
+                if count == 0:
+                    first[i, 0] = start
+                W[i, count] = before - after
+                count += 1
+            far, before, start = near, after, end
+        first[i, 1] = count
 
 
 @compiled
@@ -434,6 +473,7 @@ def _compare(
     samples: FloatArray,
     ring_part: FloatArray,
     dot_part: FloatArray,
+    first: IntArray,
     W: FloatArray,
     N: FloatArray,
     c: FloatArray,
@@ -446,23 +486,25 @@ def _compare(
     out[_GAP], out[_BEHIND_RING] = 0.0, 0.0
     for i in range(m):
         level = 0.0
-        for a in range(cells):
-            level += W[i, a] * (c[0, a] + c[1, a] + c[2, a]) / 3
+        for j in range(first[i, 1]):
+            a = _cell(first[i, 0] + j, cells)
+            level += W[i, j] * (c[0, a] + c[1, a] + c[2, a]) / 3
         gap = samples[gap_row, i] - dot_part[gap_row, i] - ring_part[gap_row, i] * level
         behind = samples[behind_row, i] - dot_part[behind_row, i] - ring_part[behind_row, i] * level
         mean = 0.0
         for row in range(len(IN_RING)):
             v = samples[row, i] - dot_part[row, i]
-            for a in range(cells):
-                v -= ring_part[row, i] * W[i, a] * c[row, a]
+            for j in range(first[i, 1]):
+                v -= ring_part[row, i] * W[i, j] * c[row, _cell(first[i, 0] + j, cells)]
             mean += v * v / len(IN_RING)
-        for a in range(cells):
-            weight[a] += W[i, a]
-            squares[a] += W[i, a] * mean
-            out[_GAP, a] += W[i, a] * gap
+        for j in range(first[i, 1]):
+            a = _cell(first[i, 0] + j, cells)
+            weight[a] += W[i, j]
+            squares[a] += W[i, j] * mean
+            out[_GAP, a] += W[i, j] * gap
             if not math.isnan(behind):
-                out[_BEHIND_RING, a] += W[i, a] * behind
-                seen[a] += W[i, a]
+                out[_BEHIND_RING, a] += W[i, j] * behind
+                seen[a] += W[i, j]
     for a in range(cells):
         for row in range(len(IN_RING)):
             out[row, a] = c[row, a]
