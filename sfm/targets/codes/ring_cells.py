@@ -7,9 +7,10 @@ import math
 import numpy as np
 
 from sfm.model.conventions import AnyArray, FloatArray, IntArray
-from sfm.runtime.compiling import compiled
+from sfm.runtime.compiling import compiled, compiled_fast
 from sfm.runtime.sampling import bilinear
 from sfm.runtime.small_algebra import invert_symmetric
+from sfm.targets.fits.blurred_ellipse import edge_profile
 
 # Samples per cell, and trial positions of the first cell.
 SAMPLES, PHASES = 12, 12
@@ -345,11 +346,6 @@ def _scatter(c: FloatArray) -> float:
 
 
 @compiled
-def _phi(t: float) -> float:
-    return 0.5 * math.erfc(-t / math.sqrt(2.0))
-
-
-@compiled
 def _circle(m: int) -> FloatArray:
     """Return cosine and sine of m directions, clockwise in the image as y is down, (m, 2)."""
     t = 2 * math.pi * np.arange(m) / m
@@ -400,7 +396,7 @@ def _radius(row: int, inner: float, outer: float) -> float:
     return inner + BEHIND * (outer - inner)
 
 
-@compiled
+@compiled_fast
 def _parts(
     shape: FloatArray,
     blur: float,
@@ -421,17 +417,21 @@ def _parts(
     det = p * r - q * q
     s = math.sqrt(blur * blur + INTERPOLATION)
     half, middle, more = len(circle) // 2, (inner + outer) / 2, glow / s
+    steep = np.empty(half)
     for i in range(half):
         u, v = circle[i, 0], circle[i, 1]
         ex, ey = (r * u - q * v) / det, (p * v - q * u) / det
         # Ends of cells lie along e; a turn by dt moves the sample by rho dt / (det |e|) across them.
-        sigma[i] = sigma[half + i] = s * det * math.hypot(ex, ey) / middle
-        f = 1 / (math.hypot(p * u + q * v, q * u + r * v) * s)  # 1 / (|grad rho| s)
-        for row in range(rows):
-            rho = _radius(row, inner, outer)
-            of_ring = _phi((rho - inner) * f + more) - _phi((rho - outer) * f - more)
-            ring_part[row, i] = ring_part[row, half + i] = of_ring
-            dot_part[row, i] = dot_part[row, half + i] = _phi((1 - rho) * f + more)
+        sigma[i] = sigma[half + i] = s * det * math.sqrt(ex * ex + ey * ey) / middle
+        steep[i] = 1 / (math.sqrt((p * u + q * v) ** 2 + (q * u + r * v) ** 2) * s)  # 1 / (|grad rho| s)
+    for row in range(rows):
+        rho = _radius(row, inner, outer)
+        for i in range(half):
+            from_inner, to_outer = (rho - inner) * steep[i] + more, (rho - outer) * steep[i] - more
+            ring_part[row, i] = edge_profile(from_inner)[0] - edge_profile(to_outer)[0]
+            dot_part[row, i] = edge_profile((1 - rho) * steep[i] + more)[0]
+        for i in range(half):
+            ring_part[row, half + i], dot_part[row, half + i] = ring_part[row, i], dot_part[row, i]
 
 
 @compiled
@@ -453,12 +453,12 @@ def _mixture(sigma: FloatArray, phase: float, shift: FloatArray, first: IntArray
         a = math.floor(position) - reach
         start = a % cells
         far = (position - a - shift[0, start]) * scale - shift[1, start]
-        before, count = _phi(far), 0
+        before, count = edge_profile(far)[0], 0
         for _ in range(2 * reach + 1):
             a += 1
             end = _cell(start + 1, cells)
             near = (position - a - shift[0, end]) * scale - shift[1, end]
-            after = _phi(near)
+            after = edge_profile(near)[0]
             if near < 4 and far > -4:
                 if count == 0:
                     first[i, 0] = start
