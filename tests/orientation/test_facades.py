@@ -10,12 +10,13 @@ import pytest
 from sfm.model.camera import project
 from sfm.model.network import ImagePoints, empty_estimate
 from sfm.model.similarity import fit_similarity, reverse_depth
-from sfm.orientation.incremental import poor_photographs
+from sfm.orientation.incremental import poor_photographs, sequence
 from sfm.orientation.incremental.growth import residual_lengths
 from sfm.orientation.incremental.poor_photographs import _ResectionFit, bounded_costs
 from sfm.orientation.incremental.sequence import orient
 from sfm.survey.orientation import refine
 from tests.facades import SIZE_PX, facade_network
+from tests.synthetic import make_network, seed_of
 
 SIGMAS_PX = (0.005, 0.15, 1.0)  # stated; the noise is 0.15 px
 # (relief, seed) of arcs of 6 to 20 degrees that ended in a wrong minimum before rivals were followed
@@ -46,6 +47,29 @@ def _worst(estimate, truth):
 def test_a_shallow_facade_is_not_turned_inside_out(relief, seed):
     oriented, worst, rms = facade_errors(seed, relief, (6.0, 20.0))
     # a wrong minimum had errors of 0.2 of the distance and an RMS of 0.19 to 0.34 px
+    assert oriented == 8 and worst < 0.05 and rms < 0.15
+
+
+def test_a_part_that_cannot_be_reversed_excludes_the_reversal_of_many(monkeypatch):
+    """Of many photographs, only the best connected ones are reversed where that fits far worse."""
+    network, truth = make_network(seed_of("reversed part"), images=16, points=60, visibility=0.6)
+    start = empty_estimate(network, truth.cameras)
+    whole, left_out = orient(network, start, refine=refine), []
+
+    def counted(growth, empty, adjust, without):
+        left_out.append(int(without.sum()))
+        return poor_photographs.reversed_growth(growth, empty, adjust, without)
+
+    monkeypatch.setattr(sequence, "reversed_growth", counted)
+    monkeypatch.setattr(sequence, "MOST_REVERSED", 5)
+    part = orient(network, start, refine=refine)
+    assert left_out == [11]
+    np.testing.assert_array_equal(part.estimate.position, whole.estimate.position)
+
+
+def test_a_part_that_can_be_reversed_decides_nothing(monkeypatch):
+    monkeypatch.setattr(sequence, "MOST_REVERSED", 4)
+    oriented, worst, rms = facade_errors(10, 0.5, (6.0, 20.0))
     assert oriented == 8 and worst < 0.05 and rms < 0.15
 
 

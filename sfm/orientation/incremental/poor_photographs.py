@@ -23,6 +23,7 @@ from dataclasses import replace
 from typing import NamedTuple
 
 import numpy as np
+from scipy.sparse import csr_matrix
 
 from sfm.model.camera import tangents_from_pixel
 from sfm.model.conventions import BoolArray, FloatArray, IntArray
@@ -185,6 +186,30 @@ def reversed_growth(growth: Growth, empty: Growth, refine: Refine, without: Bool
         empty.reasons[i] = CONTRADICTING
     empty.adjust(refine, everything=True)
     return empty
+
+
+def best_connected(growth: Growth, most: int) -> BoolArray:
+    """Return a part of the oriented photographs, (m,): each has most points in common with those before.
+
+    Args:
+        growth: the network.
+        most: number of photographs; all oriented ones if there are fewer.
+    """
+    network, estimate = growth.network, growth.estimate
+    if estimate.oriented.sum() <= most:
+        return estimate.oriented
+    seen = network.image_points
+    seen = seen.select(estimate.oriented[seen.image] & estimate.determined[seen.point])
+    shape = len(network.images), len(network.points)
+    shows = csr_matrix((np.ones(len(seen)), (seen.image, seen.point)), shape)
+    common, chosen = np.bincount(seen.image, minlength=shape[0]).astype(float), np.zeros(shape[0], dtype=bool)
+    covered = np.zeros(shape[1])
+    for _ in range(most):
+        best = int(np.argmax(np.where(estimate.oriented & ~chosen, common, -1.0)))
+        chosen[best] = True
+        covered[shows.indices[shows.indptr[best] : shows.indptr[best + 1]]] = 1.0
+        common = shows @ covered
+    return chosen
 
 
 def worst_photographs(residuals_px: FloatArray, image: IntArray, m: int) -> BoolArray:

@@ -37,6 +37,7 @@ from sfm.orientation.incremental.growth import (
 )
 from sfm.orientation.incremental.poor_photographs import (
     SMALLER_TOLERANCES,
+    best_connected,
     bounded_costs,
     casts_doubt,
     judge_misfits,
@@ -60,6 +61,7 @@ FINAL_TOLERANCE_PX = 4.0  # no image point is excluded below this here; the adju
 # of 9 photographs with 25 % wrong matches, growing again corrected one, of which 5 were oriented, and none
 # with more than this share; it takes three times as long.
 MOST = 0.75
+MOST_REVERSED = 60  # photographs of the part whose reversal in depth is adjusted first
 MIN_RIVALS = 3  # oriented photographs; with two, other knowledge decides, see `best_start`
 GROWTH = 1.25  # growth in the number of photographs after which the network is adjusted again
 MAX_ROUNDS = 200
@@ -253,7 +255,8 @@ def _best_of_rivals(
     """Return the solution with the smallest residuals among the first one and, if it is in doubt, its rivals.
 
     A solution is in doubt if its reversal in depth fits almost as well, if it leaves residuals beyond the
-    final tolerance, or if photographs had to be dropped and many are not oriented.
+    final tolerance, or if photographs had to be dropped and many are not oriented. The reversal of many
+    photographs is adjusted only if that of a part fits almost as well.
 
     Args:
         growth: network with the first solution.
@@ -269,10 +272,16 @@ def _best_of_rivals(
         return growth, start
     image = growth.network.image_points.image
     solutions, first = [(growth, start)], growth.residuals_px()
-    none_dropped = np.zeros(len(oriented), dtype=bool)
-    other_side = reversed_growth(growth, begin(values, 1.0), refine, none_dropped)
     split = growth.dropped.any() and oriented.mean() < MOST
     loose = bool((growth.tolerance_px > final_tolerance_px).any() or split)
+    if not loose:  # a part that cannot be reversed excludes that of the whole
+        others = oriented & ~best_connected(growth, MOST_REVERSED)
+        if others.any():
+            part = reversed_growth(growth, begin(values, 1.0), refine, others)
+            if not casts_doubt(growth, part):
+                return growth, start
+    none_dropped = np.zeros(len(oriented), dtype=bool)
+    other_side = reversed_growth(growth, begin(values, 1.0), refine, none_dropped)
     if not loose and not casts_doubt(growth, other_side):
         return growth, start
     rivals = [other_side]
