@@ -314,14 +314,14 @@ def test_of_a_large_network_the_points_of_most_rays_are_taken(monkeypatch: pytes
     assert hypotheses._sample(a.network, a.estimate)[2].all()
 
 
-def test_of_very_many_photographs_nothing_is_tested(a: Adjustment, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_very_many_photographs_are_tested_in_parts(a: Adjustment, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(hypotheses, "find_causes", lambda *_: ())
     monkeypatch.setattr(hypotheses, "unchecked_assumptions", lambda *_: ())
     monkeypatch.setattr(hypotheses, "MAX_PHOTOGRAPHS", 6)
     assert [one.kind for one in judge_alternatives(a).unchecked] == ["assumptions_tested"]
     monkeypatch.setattr(hypotheses, "MAX_PHOTOGRAPHS", 5)
     (one,) = judge_alternatives(a).unchecked
-    assert one.kind == "photographs_untested" and one.names("photographs") == a.network.images
+    assert one.kind == "assumptions_tested" and one.number("parts") == 1
     monkeypatch.setattr(hypotheses, "free_network", None)  # is not asked for
     assert contradicted_parameters(a) == ()
 

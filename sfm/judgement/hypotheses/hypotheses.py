@@ -31,6 +31,7 @@ from sfm.judgement.hypotheses.alternatives import (
 )
 from sfm.judgement.hypotheses.columns import columns_of
 from sfm.judgement.hypotheses.families import HELD, MOVED, Alternative, InteriorFamily, PointFamily
+from sfm.judgement.hypotheses.parts import of_all_parts, parts_of, reduced_to
 from sfm.judgement.hypotheses.refit import (
     Refit,
     log_likelihood_of,
@@ -64,7 +65,9 @@ MAX_IMAGE_POINTS = 6_000  # largest tested network; of a larger one, the points 
 # Adjustments of a search times the cube of the photographs, to which their time is proportional. Its
 # alternatives share them, and only the best is adjusted to the end: 46 of 186 photographs, half a minute.
 MAX_WORK = 3e8
-MAX_PHOTOGRAPHS = 300  # largest tested network, because its normal equations are dense
+MAX_PHOTOGRAPHS = 300  # largest network that is tested as a whole, as its normal equations are dense
+PART_PHOTOGRAPHS = 100  # of the parts of a larger one: each takes 1 to 5 s
+WITHOUT = "the other photographs"  # with which those of a part do not shift
 MIN_SHAPE = 4  # given points with a shape that the datum does not determine
 OF_FREE_POINTS = (  # tests that do not apply to given points
     "assumptions_tested",
@@ -121,8 +124,7 @@ def judge_alternatives(final: Adjustment, *, unit: str = "") -> JudgedAssumption
     if not final.converged or not final.sigma0 > 0 or final.is_exact:
         return JudgedAssumptions()  # no result, or an exact one, which nothing contradicts
     if len(photographs) > MAX_PHOTOGRAPHS:
-        many = remark("photographs_untested", photographs=photographs, most=MAX_PHOTOGRAPHS)
-        return JudgedAssumptions(unchecked=(many,))
+        return _judge_parts(final, unit)
     calibration = _is_calibration(final)
     without = "control" if calibration or not final.unknown_counts[2] else None
     free = free_network(final)
@@ -143,6 +145,34 @@ def judge_alternatives(final: Adjustment, *, unit: str = "") -> JudgedAssumption
     )
     tested = remark("assumptions_tested", photographs=photographs, causes=len(judged.causes))
     return replace(judged, unchecked=(tested, *few, *unchecked))
+
+
+def _judge_parts(final: Adjustment, unit: str) -> JudgedAssumptions:
+    """Return the evidence of the image points of each part of a large network alone."""
+    network, used = final.network, ~final.rejected
+    parts = parts_of(network, used, PART_PHOTOGRAPHS)
+    causes, tested = [], np.zeros(len(network.images), dtype=bool)
+    reduced = reduced_to(network, final.estimate, used, parts)
+    for images, (part, start, rows) in zip(parts, reported("parts tested", reduced, len(parts)), strict=True):
+        factor, alarm = final.image_sigma_factor[rows], final.false_alarm / len(parts)
+        plain = adjust_image_points(part, start, final.rejected[rows], factor, false_alarm=alarm)
+        if plain is None:
+            continue
+        if final.error_correlation is not None:
+            plain = with_error_correlation(plain, final.error_correlation)
+        try:
+            accepted = find_causes(plain)
+        except np.linalg.LinAlgError:
+            continue
+        tested |= images
+        causes += [remark_of(plain, cause, unit, WITHOUT) for cause in accepted]
+    joined, names, unchecked = of_all_parts(causes), np.array(network.images), []
+    if tested.any():
+        size = {"parts": len(parts), "most": max(int(part.sum()) for part in parts)}
+        unchecked.append(remark("assumptions_tested", photographs=names[tested], causes=len(joined), **size))
+    if not tested.all():
+        unchecked.append(remark("photographs_untested", photographs=names[~tested]))
+    return JudgedAssumptions(joined, tuple(unchecked))
 
 
 def _judge_free(plain: Adjustment | None, unit: str, without: str | None) -> JudgedAssumptions:

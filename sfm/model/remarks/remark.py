@@ -8,7 +8,7 @@ the sentence, the cause and the remedy.
 from __future__ import annotations
 
 import math
-from collections.abc import Iterable
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, replace
 from typing import Any
 
@@ -151,3 +151,23 @@ def of_kind(remarks: Iterable[Remark], *kinds: str) -> tuple[Remark, ...]:
 def kinds_of(remarks: Iterable[Remark]) -> tuple[str, ...]:
     """Return the kind of each remark, in their order."""
     return tuple(said.kind for said in remarks)
+
+
+def together(remarks: Sequence[Remark]) -> Remark:
+    """Return one remark for several of one kind: the subjects of all, and the largest of each number."""
+    roles = dict.fromkeys(role for said in remarks for role in said.subjects)
+    numbers = dict.fromkeys(name for said in remarks for name in said.numbers)
+    return replace(
+        remarks[0],
+        subjects={
+            role: tuple(dict.fromkeys(name for said in remarks for name in said.subjects.get(role, ())))
+            for role in roles
+        },
+        numbers={
+            name: max(
+                (said.numbers[name] for said in remarks if name in said.numbers),
+                key=lambda quantity: quantity.value,
+            )
+            for name in numbers
+        },
+    )

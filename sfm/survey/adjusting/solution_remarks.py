@@ -20,7 +20,7 @@ from sfm.model.estimate import Estimate
 from sfm.model.network import Network
 from sfm.model.observations.kind import Group
 from sfm.model.observations.pose import MountObservations
-from sfm.model.remarks.remark import Remark, remark
+from sfm.model.remarks.remark import Remark, remark, together
 from sfm.survey.inputs.calibration import is_plate_control, plate_control, plate_family
 from sfm.survey.inputs.settings import CameraSettings
 from sfm.survey.inputs.survey import Survey
@@ -109,27 +109,9 @@ def windows_elsewhere(network: Network, remarks: Sequence[Remark]) -> tuple[Rema
     elsewhere = [
         said for said in remarks if said.kind == "points_moved" and are_windows(said.names("points"))
     ]
-    together: Remark | None = None
-    if elsewhere:
-        roles = dict.fromkeys(role for said in elsewhere for role in said.subjects)
-        numbers = dict.fromkeys(name for said in elsewhere for name in said.numbers)
-        together = replace(
-            elsewhere[0],
-            kind="windows_elsewhere",
-            subjects={
-                role: tuple(dict.fromkeys(name for said in elsewhere for name in said.names(role)))
-                for role in roles
-            },
-            numbers={
-                name: max(
-                    (said.numbers[name] for said in elsewhere if name in said.numbers),
-                    key=lambda quantity: quantity.value,
-                )
-                for name in numbers
-            },
-        )
+    joined = replace(together(elsewhere), kind="windows_elsewhere") if elsewhere else None
     return tuple(
-        together if together is not None and said is elsewhere[0] else said
+        joined if joined is not None and said is elsewhere[0] else said
         for said in remarks
         if not any(said is other for other in elsewhere[1:])
         and (said.kind != "two_places" or said.names("point")[0] not in texture)

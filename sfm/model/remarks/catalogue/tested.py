@@ -48,7 +48,7 @@ ROWS = (
     Tested(
         "assumptions_tested",
         "constant cameras and object",
-        "{photographs:photograph}",
+        "{photographs:photograph}[[, in {parts:part} of at most {most}]]",
         "{causes:contradiction}",
     ),
     Tested(
@@ -59,7 +59,7 @@ ROWS = (
     ),
     Tested(
         "photographs_untested",
-        "constant object[[ and cameras, of at most {most:photograph}]]",
+        "constant object",
         "{photographs:photograph}",
         "not tested[[: the test needs {needed:photograph}]]",
     ),

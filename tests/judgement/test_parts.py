@@ -1,0 +1,129 @@
+"""Assumptions of large networks, which are tested in parts."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+import sfm
+from sfm.adjustment.result import Adjustment
+from sfm.judgement.hypotheses import hypotheses
+from sfm.judgement.hypotheses.hypotheses import judge_alternatives
+from sfm.judgement.hypotheses.parts import of_all_parts, parts_of
+from sfm.model.camera import project
+from sfm.model.estimate import Estimate
+from sfm.model.network import ImagePoints, Network
+from sfm.model.remarks.remark import remark
+from tests.synthetic import make_network, seed_of
+
+PHOTOGRAPHS = 24
+MOVED = np.array([0.0005, 0.0, 0.00025])  # larger movements are gross errors of single image points
+
+
+@pytest.fixture
+def in_parts(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Networks of more than 15 photographs are large, and tested in parts of 12."""
+    monkeypatch.setattr(hypotheses, "MAX_PHOTOGRAPHS", 15)
+    monkeypatch.setattr(hypotheses, "PART_PHOTOGRAPHS", 12)
+
+
+def network_of(name: str, free: tuple[str, ...] = ("c", "x0", "y0")) -> tuple[Network, Estimate]:
+    return make_network(seed_of(name), images=PHOTOGRAPHS, points=50, visibility=0.8, free=free)
+
+
+def free_adjustment(network: Network, start: Estimate) -> Adjustment:
+    return sfm.adjust(network, start, datum="free", reject="tau")
+
+
+def along_a_line(m: int, each: int, step: int) -> Network:
+    """Photographs in a random order, which each show so many points of a line, `step` after the last ones."""
+    place = seed_of("along a line").permutation(m)
+    point = (step * place[:, None] + np.arange(each)).ravel()
+    image = np.repeat(np.arange(m), each)
+    seen = ImagePoints(image, point, np.zeros((len(image), 2)), np.tile(np.eye(2), (len(image), 1, 1)))
+    names = tuple(map(str, range(int(point.max()) + 1)))
+    return Network(tuple(f"{k}" for k in place), np.zeros(m, dtype=np.int64), names, seen)
+
+
+def test_a_part_has_photographs_that_show_the_same_points() -> None:
+    network = along_a_line(100, 40, 10)
+    parts = parts_of(network, np.ones(len(network.image_points), dtype=bool), 30)
+    assert len(parts) == 4 and (np.sum(parts, axis=0) == 1).all()
+    place = np.array(network.images, dtype=int)
+    for part in parts:
+        assert 20 <= part.sum() <= 30
+        assert np.ptp(place[part]) + 1 == part.sum(), "a part of the line without gaps"
+
+
+def test_photographs_of_a_moment_stay_together() -> None:
+    network = along_a_line(60, 40, 10)
+    place = np.array(network.images, dtype=int)
+    parts = parts_of(replace(network, moment=place // 3), np.ones(len(network.image_points), bool), 12)
+    assert (np.sum(parts, axis=0) == 1).all()
+    of = np.argmax(parts, axis=0)
+    assert all(len(np.unique(of[place // 3 == moment])) == 1 for moment in range(20))
+    assert max(part.sum() for part in parts) <= 12
+
+
+@pytest.mark.usefixtures("in_parts")
+def test_of_a_right_network_every_part_is_tested() -> None:
+    network, truth = network_of("right in parts")
+    judged = judge_alternatives(free_adjustment(network, truth))
+    assert not judged.causes
+    (said,) = judged.unchecked
+    assert said.kind == "assumptions_tested" and sorted(said.names("photographs")) == sorted(network.images)
+    assert said.number("parts") == 2 and said.number("most") == 12
+    assert "in 2 parts of at most 12" in said.text
+
+
+@pytest.mark.usefixtures("in_parts")
+def test_a_wrong_lens_is_one_remark_of_all_parts() -> None:
+    network, truth = network_of("wrong lens in parts")
+    (camera,) = truth.cameras
+    values = camera.parameters * np.where(np.array(camera.names) == "K1", 0.9, 1.0)
+    start = replace(truth, cameras=(camera.with_parameters(values),))
+    (said,) = judge_alternatives(free_adjustment(network, start)).causes
+    assert said.kind == "held_parameter" and "K1" in said.names("parameters")
+
+
+@pytest.mark.usefixtures("in_parts")
+def test_points_that_moved_are_named_by_their_part() -> None:
+    network, truth = network_of("moved in parts", free=())
+    seen = network.image_points
+    moved, later = np.isin(seen.point, (4, 9, 17)), seen.image >= PHOTOGRAPHS // 2
+    xy = seen.xy.copy()
+    for k in np.flatnonzero(moved & later):
+        i, points = seen.image[k], truth.points[[seen.point[k]]]
+        pose = truth.cameras[0], truth.position[i], truth.rotation[i]
+        xy[k] += (project(*pose, points + MOVED) - project(*pose, points))[0]
+    judged = judge_alternatives(free_adjustment(replace(network, image_points=replace(seen, xy=xy)), truth))
+    named = {name for said in judged.causes if said.kind == "points_moved" for name in said.names("points")}
+    assert named == {network.points[j] for j in (4, 9, 17)}
+
+
+@pytest.mark.usefixtures("in_parts")
+def test_photographs_of_parts_without_a_solution_are_not_tested(monkeypatch: pytest.MonkeyPatch) -> None:
+    network, truth = network_of("half in parts")
+    solved = hypotheses.adjust_image_points
+    count = iter(range(9))
+
+    def first_only(*given: object, **how: object) -> Adjustment | None:
+        return solved(*given, **how) if next(count) == 0 else None  # type: ignore[arg-type]
+
+    a = free_adjustment(network, truth)
+    monkeypatch.setattr(hypotheses, "adjust_image_points", first_only)
+    tested, untested = judge_alternatives(a).unchecked
+    assert untested.kind == "photographs_untested"
+    both = (*tested.names("photographs"), *untested.names("photographs"))
+    assert sorted(both) == sorted(network.images) and len(untested.names("photographs")) == 12
+
+
+def test_remarks_of_parts_are_joined_by_kind_and_camera() -> None:
+    one = remark("held_parameter", parameters=("K1",), camera="a", shift=3.0)
+    other = remark("held_parameter", parameters=("K1", "K2"), camera="a", shift=5.0)
+    apart = remark("held_parameter", parameters=("K1",), camera="b", shift=9.0)
+    joined, single = of_all_parts((one, other, apart))
+    assert joined.names("parameters") == ("K1", "K2") and joined.number("shift") == 5.0
+    assert single == apart
