@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import replace
 from importlib.metadata import version
 
 import numpy as np
@@ -57,11 +58,17 @@ def page(unfinished: UnfinishedSurvey, *, overlays: Sequence[Overlay] = ()) -> P
 
 
 def verdict(unfinished: UnfinishedSurvey) -> Verdict:
-    """Return the verdict: bad, whatever the remarks of the stages that were reached."""
+    """Return the verdict: bad, whatever the remarks of the stages that were reached.
+
+    Where one of them is the reason, it is an error, and its text is not repeated as the headline.
+    """
     remarks = [remark for remark in unfinished.remarks if remark.test is None]
     tests = [remark for remark in unfinished.remarks if remark.test is not None]
+    why = [remark for remark in remarks if unfinished.reason.startswith(remark.text.rstrip("."))]
+    remarks = [replace(remark, at_least="error") if remark in why else remark for remark in remarks]
     remarks.sort(key=lambda remark: SEVERITIES.index(remark.severity))
-    return Verdict("bad", unfinished.reason, tuple(remarks), tuple(tests))
+    headline = f"The survey stopped in the stage {unfinished.stage}." if why else unfinished.reason
+    return Verdict("bad", headline, tuple(remarks), tuple(tests))
 
 
 def summary(unfinished: UnfinishedSurvey) -> dict[str, object]:
