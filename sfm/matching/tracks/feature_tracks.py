@@ -25,13 +25,16 @@ from sfm.matching.tracks.features import (
     Features,
     PairMatches,
     TwoMotions,
-    common_features,
-    connected_parts,
-    connecting_pairs,
     matched_features,
-    overlapping_pairs,
 )
 from sfm.matching.tracks.interest import NaturalPoints
+from sfm.matching.tracks.overlap import (
+    compare_parts,
+    compare_photographs,
+    connected_parts,
+    connecting_pairs,
+    overlapping_pairs,
+)
 from sfm.model.arguments import checked_arguments, checked_fields
 from sfm.model.conventions import AnyArray, BoolArray, FloatArray, IntArray
 from sfm.model.display import counted
@@ -168,7 +171,7 @@ def link_features(
         features: features of m photographs.
         min_rays: fewest photographs per point.
         seed: seed of the random samples.
-        threads: number of pairs matched at the same time.
+        threads: number of pairs compared and matched at the same time.
         known: matches of pairs of photographs that need not be matched again; new matches are added to it.
         neighbours: photographs taken near each photograph, see `overlapping_pairs`.
     """
@@ -176,11 +179,8 @@ def link_features(
     first = np.concatenate([[0], np.cumsum([len(of_photograph) for of_photograph in features])]).astype(
         np.int64
     )
-    score = common_features(
-        [of_photograph.descriptor for of_photograph in features],
-        [of_photograph.scale for of_photograph in features],
-    )
-    pairs = overlapping_pairs(score, neighbours=neighbours)
+    compared = compare_photographs(features, neighbours=neighbours, seed=seed, threads=threads)
+    pairs = overlapping_pairs(compared, neighbours=neighbours)
 
     def match(of: IntArray) -> _MatchedFeatures:
         every = [(i, j) for i, j in of.tolist()]
@@ -194,7 +194,8 @@ def link_features(
     matched = match(pairs)
     part = connected_parts(pairs[np.unique(matched.pair)], len(features))
     if part.max(initial=0):
-        matched = match(np.concatenate([pairs, connecting_pairs(score, part, pairs)]))
+        compared = compare_parts(features, compared, part, seed=seed, threads=threads)
+        matched = match(np.concatenate([pairs, connecting_pairs(compared, part, pairs)]))
     image = np.repeat(np.arange(len(features)), np.diff(first))
     edge = matched.edge[np.argsort(-matched.distinct, kind="stable")]
     group = joined_features(edge, image, len(features))

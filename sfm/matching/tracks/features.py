@@ -1,36 +1,22 @@
-"""SIFT features of natural texture, and pairs of photographs that overlap enough to be matched.
-
-Matching every photograph with every other takes time that grows with the square of their number. A few
-hundred of the coarsest features of each photograph are therefore compared first, since these are the most
-likely to be found again from another viewpoint. The number of features that choose each other shows which
-photographs overlap. This takes a small part of the time of matching all pairs.
+"""SIFT features of natural texture, and those that two photographs have in common.
 
 Source: Lowe (2004), IJCV 60(2); Hartley and Zisserman (2003), sec. 11.6 (epipolar geometry by RANSAC).
 """
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import NamedTuple
 
 import cv2
 import numpy as np
-from scipy.sparse import csr_matrix
-from scipy.sparse.csgraph import connected_components
 
 from sfm.matching.radiometry import FULL_SCALE_8, grey_of_8_bit
 from sfm.model.conventions import AnyArray, BoolArray, FloatArray, IntArray
 from sfm.runtime.compiling import compiled
 from sfm.runtime.sampling import is_shown
 
-FEATURES = 250  # of each photograph, the coarsest ones
-PARTNERS = 10  # of each photograph, by common features
-NEIGHBOURS = 4  # of each photograph, by position, whatever they show
 MIN_MUTUAL_FEATURES = 6  # mutual matches from which an overlap is not due to chance
-# Partners of a photograph with few clear ones, or that is not connected with the others. They include nearly
-# all overlapping ones (96 to 100 % if 3 of 10 features are found again); more photographs mean more pairs.
-MANY_PARTNERS = 30
 RATIO = 0.8  # of the distances to the nearest and the second-nearest descriptor; Lowe (2004), IJCV 60(2)
 EPIPOLAR_PX = 4.0  # distance from the epipolar line; lens distortion is not yet known
 MIN_PAIR_MATCHES = 20  # with fewer the epipolar geometry of a pair is not trusted
@@ -312,86 +298,3 @@ def _update_nearest(similarity: AnyArray, begin: int, nearest: _Nearest, of_back
             if value > of_back[j]:
                 of_back[j], nearest.back[j] = value, begin + i
         nearest.forth[begin + i], nearest.best[begin + i], nearest.second[begin + i] = at, best, second
-
-
-def overlapping_pairs(
-    score: IntArray, *, partners: int = PARTNERS, neighbours: Sequence[IntArray] = ()
-) -> IntArray:
-    """Return the pairs of photographs (i < j) that are worth matching, (p, 2).
-
-    Every photograph is paired with its best `partners` and its nearest neighbours. If fewer than half as many
-    partners are clear, it receives MANY_PARTNERS and all its neighbours.
-
-    Args:
-        score: number of common features of two photographs, see `common_features`, (m, m).
-        partners: smallest number of partners per photograph; all others if there are no more.
-        neighbours: photographs taken near each photograph, the nearest first, negative for none. One array
-            (m, k) for each source of this knowledge.
-    """
-    m = len(score)
-    if m <= partners + 1:
-        return np.column_stack(np.triu_indices(m, 1))
-    mutual = score + score.T
-    lost = (mutual >= MIN_MUTUAL_FEATURES).sum(axis=1) < partners / 2
-    wanted = _best_partners(mutual, np.where(lost, MANY_PARTNERS, partners))
-    for near in neighbours:
-        used = (near >= 0) & (lost[:, None] | (np.arange(near.shape[1]) < NEIGHBOURS))
-        wanted[np.nonzero(used)[0], near[used]] = True
-    return np.argwhere(np.triu(wanted | wanted.T, 1))
-
-
-def connecting_pairs(score: IntArray, part: IntArray, tried: IntArray) -> IntArray:
-    """Return pairs of photographs (i < j) that may connect parts: MANY_PARTNERS per photograph, (p, 2).
-
-    Args:
-        score: number of common features of two photographs, see `common_features`, (m, m).
-        part: number of the part to which each photograph belongs, (m,).
-        tried: pairs that were matched, (q, 2).
-    """
-    apart = part[:, None] != part
-    apart[tried[:, 0], tried[:, 1]] = apart[tried[:, 1], tried[:, 0]] = False
-    wanted = _best_partners(np.where(apart, score + score.T, -1), np.full(len(score), MANY_PARTNERS)) & apart
-    return np.argwhere(np.triu(wanted | wanted.T, 1))
-
-
-def _best_partners(score: IntArray, count: IntArray) -> BoolArray:
-    """Return which others have the highest scores with each photograph, `count` of them, (m, m)."""
-    ranked = np.where(np.eye(len(score), dtype=bool), -2, score)
-    order = np.argsort(-ranked, axis=1, kind="stable")[:, : len(score) - 1]
-    best = np.zeros(score.shape, dtype=bool)
-    np.put_along_axis(best, order, np.arange(order.shape[1]) < count[:, None], axis=1)
-    return best
-
-
-def common_features(descriptors: Sequence[AnyArray], scales: Sequence[FloatArray]) -> IntArray:
-    """Return how many of the coarsest features choose each other, for photographs i < j, (m, m)."""
-    m = len(descriptors)
-    coarse = [d[np.argsort(-s, kind="stable")[:FEATURES]] for d, s in zip(descriptors, scales, strict=True)]
-    first = np.cumsum([0, *(len(descriptor) for descriptor in coarse)])
-    every = np.concatenate(coarse)
-    score = np.zeros((m, m), dtype=np.int64)
-    for i in range(m):
-        if len(coarse[i]) < 2:
-            continue
-        similarity = every[first[i + 1] :] @ coarse[i].T
-        forth = similarity.argmax(axis=1)
-        rows = np.arange(len(similarity))
-        best = similarity[rows, forth]
-        # the best feature of each photograph for every feature of this one
-        starts = first[i + 1 : -1] - first[i + 1]
-        with_features = np.flatnonzero(np.diff(first[i + 1 :]))
-        if not len(with_features):
-            continue
-        back = np.maximum.reduceat(similarity, starts[with_features], axis=0)
-        of = np.repeat(np.arange(len(with_features)), np.diff(first[i + 1 :])[with_features])
-        mutual = best >= back[of, forth]
-        similarity[rows, forth] = -1.0
-        clear = 1 - best < RATIO**2 * (1 - similarity.max(axis=1))
-        score[i, i + 1 + with_features] = np.bincount(of[mutual & clear], minlength=len(with_features))
-    return score
-
-
-def connected_parts(pairs: IntArray, m: int) -> IntArray:
-    """Return for each of m photographs the number of its connected part, (m,)."""
-    links = csr_matrix((np.ones(len(pairs)), (pairs[:, 0], pairs[:, 1])), shape=(m, m))
-    return np.asarray(connected_components(links, directed=False)[1], dtype=np.int64)

@@ -18,8 +18,9 @@ from scipy.spatial import cKDTree
 from sfm.judgement.survey_result import PhotographTargets
 from sfm.matching.radiometry import full_scale, grey_of
 from sfm.matching.tracks.feature_tracks import Matches, TiePoints, TrackSettings, find_tie_points
-from sfm.matching.tracks.features import MIN_PAIR_MATCHES, PARTNERS
+from sfm.matching.tracks.features import MIN_PAIR_MATCHES
 from sfm.matching.tracks.interest import NaturalPoints, natural_points
+from sfm.matching.tracks.overlap import PARTNERS
 from sfm.model.conventions import BoolArray, FloatArray, IntArray
 from sfm.model.errors import GeometryError
 from sfm.model.network import ImagePoints, Network, rows_of
