@@ -18,6 +18,7 @@ from sfm.matching.tracks.overlap import (
     connecting_pairs,
     overlapping_pairs,
 )
+from sfm.matching.tracks.retrieval import similar_photographs
 from sfm.model.conventions import AnyArray, IntArray
 from tests.synthetic import seed_of
 
@@ -100,8 +101,15 @@ def test_neighbours_in_a_strip_are_chosen_and_strangers_are_not() -> None:
 
 
 def test_few_photographs_are_all_compared_by_the_mutual_nearest_of_their_coarsest_features() -> None:
-    """Against the definition, feature by feature; one photograph has no features, another a single one."""
+    """Against the definition, feature by feature; one photograph has no features, another a single one.
+
+    Every other photograph has some features twice: both choose the same one of a photograph that has it once.
+    """
+    rng = seed_of("twice")
     photographs = strip(COMPARED - 1, windows=6, own=20)
+    for of_photograph in photographs[::2]:
+        again = of_photograph.descriptor[:30] + 0.004 * rng.standard_normal((30, 128))
+        of_photograph.descriptor[60:] = unit(again[:26])
     single = Features(*(values[:1] for values in vars(photographs[3]).values()))
     photographs = [*photographs[:5], NOTHING, single, *photographs[5:]]
     compared = compare_photographs(photographs, threads=2)
@@ -116,6 +124,28 @@ def test_few_photographs_are_all_compared_by_the_mutual_nearest_of_their_coarses
             mutual = np.argmax(b @ a[nearest]) == k
             expected += bool(mutual and 1 - similarity.max() < RATIO**2 * (1 - second))
         assert common == expected, (i, j)
+
+
+def test_a_photograph_has_one_vote_of_a_feature_however_often_it_shows_the_like() -> None:
+    rng = seed_of("votes")
+    wanted, rest = rng.random((1, 128)), rng.random((4000, 128))
+
+    def alike(count: int, noise: float) -> AnyArray:
+        return wanted + noise * rng.standard_normal((count, 128))
+
+    shown = [wanted, alike(12, 0.02), alike(1, 0.04), alike(1, 0.08), rest]
+    photographs = [Features(np.zeros((len(d), 2)), np.ones(len(d)), np.zeros(len(d)), unit(d)) for d in shown]
+    rows = [np.arange(len(of_photograph)) for of_photograph in photographs]
+    asking = np.arange(5) == 0
+    for part, expected in (
+        ([0, 1, 2, 3, 4], [[0, 1], [0, 2]]),
+        ([0, 0, 1, 2, 3], [[0, 2]]),
+    ):  # none of its part
+        votes = [
+            similar_photographs(photographs, rows, np.array(part), asking, len(expected), seed=seed).tolist()
+            for seed in range(10)
+        ]
+        assert votes.count(expected) >= 7  # if one of the like is a centre, another may be in its cell alone
 
 
 @pytest.mark.parametrize("windows", [0, 30])
