@@ -328,9 +328,8 @@ def measure_tracks(
     count = np.bincount(tracks.point, minlength=n)
     reference = np.asarray(order[first + count // 2])  # the larger of two scales
     position = xy[reference].copy()
-    for i, points in enumerate(natural):
-        of_reference = np.flatnonzero(tracks.image[reference] == i)
-        position[of_reference] = _snapped(position[of_reference], points.corners)
+    for points, rows in zip(natural, rows_of(tracks.image[reference], len(natural)), strict=True):
+        position[rows] = _snapped(position[rows], points.corners)
     position = np.rint(position)  # a template of whole pixels needs no resampling
     ref = reference[tracks.point]
     offset = (position - xy[reference])[tracks.point]

@@ -135,7 +135,8 @@ def tie_photographs(
         searched = [a for a in scarce if a in alike]
         for a in reported("photographs searched for more features", searched, len(searched)):
             natural[a] = natural_points_of(files.paths[read[a]], names[a], more, masks, store)[0]
-        for pair in [pair for pair in matches if not set(pair).isdisjoint(searched)]:
+        again = set(searched)
+        for pair in [pair for pair in matches if not again.isdisjoint(pair)]:
             del matches[pair]
     if scarce and matches:
         tied = tie(SCARCE_TIE_POINTS)
