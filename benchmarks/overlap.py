@@ -28,6 +28,7 @@ import cv2
 import numpy as np
 from scipy.spatial import cKDTree
 
+from adapters.colmap.adjuster import quiet
 from sfm.matching.tracks import overlap
 from sfm.matching.tracks.features import Features, sift_features
 from sfm.matching.tracks.overlap import COMPARED, compare_photographs, overlapping_pairs
@@ -141,7 +142,7 @@ def ask_colmap(features: list[Features]) -> tuple[float, float, IntArray]:
     building.num_visual_words, building.num_iterations, building.num_rounds = words, 10, 1
     asking = pycolmap.VocabTreePairingOptions()
     asking.num_images, building.num_threads, asking.num_threads = COMPARED, 1, 1
-    with TemporaryDirectory() as folder:
+    with TemporaryDirectory() as folder, quiet(pycolmap):
         asking.vocab_tree_path = Path(folder) / "tree.bin"
         begun = time.process_time()
         tree = pycolmap.VisualIndex.create(every.shape[1], 64)

@@ -4,10 +4,10 @@
 
 Rows of surveys are whole commands, from `kolinear run` to the report: processor time of all processes, and
 wall time; nothing is measured before. Their rival is COLMAP on the same photographs: extraction, exhaustive
-matching, incremental mapping with one camera. Rows of adjustments are warm calls, and their rival is the
-best-tuned Ceres of pycolmap. FOLDER has real photographs, a folder each: retro-panel, camcal, fountain ...
-CHECKOUT is another checkout with an environment of its own, whose command is run in turn. Times are medians
-of N runs.
+matching, incremental mapping with one camera. Rows of overlap and adjustments are warm calls; their rivals
+are the search by COLMAP's vocabulary tree, without its training, and the best-tuned Ceres of pycolmap. FOLDER
+has real photographs, a folder each: retro-panel, camcal, fountain ... CHECKOUT is another checkout with an
+environment of its own, whose command is run in turn. Times are medians of N runs.
 
 The table is printed, and kept in benchmarks/results.md with the commit and the machine. Only the ratios
 within one run are meaningful, on a machine that does nothing else. A row that has become slower by 5 % is a
@@ -28,12 +28,17 @@ import time
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from datetime import UTC, datetime
+from functools import partial
+from itertools import chain
 from pathlib import Path
 
 from benchmarks.adjustment import CASES, SOLVERS, reconstruction, run_adjust, timed, timed_ceres
+from benchmarks.overlap import ask_colmap, take_photographs
 from benchmarks.textured_scenes import render_scene
+from sfm.matching.tracks.overlap import compare_photographs
 from sfm.model.estimate import Estimate
 from sfm.model.network import Network
+from sfm.runtime.threads import own_threads
 
 ROOT = Path(__file__).parent.parent
 KEPT = Path(__file__).with_name("results.md")
@@ -41,6 +46,7 @@ WORK = ROOT / "build"
 SURVEYS = ("retro-panel", "camcal")  # of targets; the survey files are in datasets/
 TEXTURES = ("fountain", "entry", "castle", "herzjesu", "fox10")
 QUICK = ("20 / 100", "60 / 500")  # ends of the names of adjustments
+OVERLAPPING = (100, 400)  # photographs among which those that overlap are searched
 HEADS = ("work", "s", "wall s", "before, s", "rival, s", "before / now", "rival / now")
 COLMAP = (
     "import sys; from pathlib import Path; from adapters.colmap.mapper import map_photographs; "
@@ -83,7 +89,8 @@ def main() -> None:
     lines = [_line(HEADS), _line(["---", *["--:"] * (len(HEADS) - 1)])]
     print(*lines, sep="\n", flush=True)
     surveys = _surveys(options.data, options.before, repeat, quick=options.quick)
-    for row in (*_printed(surveys, lines), *_printed(_adjustments(repeat, quick=options.quick), lines)):
+    calls = chain(_overlaps(repeat, quick=options.quick), _adjustments(repeat, quick=options.quick))
+    for row in (*_printed(surveys, lines), *_printed(calls, lines)):
         if row.seconds > 1.05 * row.before:
             print(f"slower than before: {row.work}")
     about = f"{_commit()}, {datetime.now(UTC):%Y-%m-%d}, {os.cpu_count()} cores, {_processor()}"
@@ -162,6 +169,15 @@ def _survey(
         statistics.median(run[0] for run in times[1]) if len(times) > 1 else float("nan"),
         statistics.median(rivals) if rivals else float("nan"),
     )
+
+
+def _overlaps(repeat: int, *, quick: bool) -> Iterator[Row]:
+    """Yield the rows of the search of photographs that overlap."""
+    for m in OVERLAPPING[:1] if quick else OVERLAPPING:
+        features = take_photographs(m, WORK / "overlap" / f"{m}.npz").features
+        with own_threads(1):
+            seconds, _ = timed(partial(compare_photographs, features), repeat, time.process_time)
+        yield Row(f"overlap: {m} photographs", seconds, rival=ask_colmap(features)[1])
 
 
 def _adjustments(repeat: int, *, quick: bool) -> Iterator[Row]:
