@@ -194,6 +194,8 @@ def test_odd_photographs_among_many_are_no_obstacle() -> None:
     pairs = set_of(overlapping_pairs(compared))
     assert {(32, 62), (32, 63), (62, 63)} <= pairs
     assert {(k, k + 1) for k in range(2, 61)} <= pairs
+    copies = overlapping_pairs(compare_photographs(some[:1] * 60))
+    assert connected_parts(copies, 60).max() == 0
     nothing = compare_photographs([NOTHING] * 60)
     assert len(overlapping_pairs(nothing)) == 0
 

@@ -69,9 +69,11 @@ def similar_photographs(
         # of unit vectors, divided by sqrt(2)
         distance = np.sqrt(np.maximum(1 - similarity[first[i] : first[i + 1]], 0))
         weight = np.max(distance, axis=1, keepdims=True, where=there, initial=0) - distance
-        votes = np.bincount(voted[first[i] : first[i + 1]][there], weight[there], minlength=m)
-        best = np.argsort(-votes, kind="stable")[:count]
-        best = best[votes[best] > 0]
+        named = voted[first[i] : first[i + 1]][there]
+        votes = np.bincount(named, weight[there], minlength=m)
+        times = np.bincount(named, minlength=m)  # decides among copies, whose votes count nothing
+        best = np.lexsort((-times, -votes))[:count]
+        best = best[times[best] > 0]
         pairs.append(np.column_stack([np.full(len(best), i), best]))
     return np.concatenate(pairs)
 
