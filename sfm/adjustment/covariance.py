@@ -32,7 +32,6 @@ from sfm.adjustment.engine.cofactors import (
 )
 from sfm.adjustment.engine.correlated import CorrelatedPart, Influence, correlated_part, influence_of
 from sfm.adjustment.engine.iterate import Optimum, optimum_at, problem_of
-from sfm.adjustment.engine.normals import solve_lower
 from sfm.adjustment.engine.observed import ObservedKind, observed_of
 from sfm.adjustment.engine.unknowns import Unknowns, unknowns_of
 from sfm.adjustment.quality.rank import reduced_names
@@ -105,24 +104,13 @@ class Marginal:
         Returns:
             Covariance of the unknowns and then X, Y, Z of each point, shape (u + 3 p, u + 3 p).
         """
-        Q, b, motions = self.cofactors, self.optimum.equations.blocks, self.optimum.motions
-        observations, first, u = self.layout.observations, self.layout.kept_start, len(unknowns)
+        Q, motions = self.cofactors, self.optimum.motions
+        first, u = self.layout.kept_start, len(unknowns)
         rows = (3 * np.asarray(points)[:, None] + np.arange(3)).ravel()
-        # each dx as a linear function of the reduced unknowns: an unknown itself, or -L^-T Y' for a point
-        through = np.zeros((self.layout.reduced, len(rows)))
-        m = observations.poses
-        of_poses = through[: 6 * m].reshape(m, 6, len(rows))
-        of_interior = through[6 * m :][: b.Y_interior.shape[2]]
-        inverse = solve_lower(b.L[points], np.tile(np.eye(3), (len(points), 1, 1)))
-        for s, j in enumerate(points):
-            seen = slice(observations.start[j], observations.start[j + 1])
-            at = slice(3 * s, 3 * s + 3)
-            rays = np.swapaxes(b.Y[seen], 1, 2) @ inverse[s]
-            np.add.at(of_poses[:, :, at], observations.pose[seen], rays)
-            of_interior[:, at] = b.Y_interior[j].T @ inverse[s]
         E = np.zeros((self.layout.reduced, u + len(rows)))
         E[unknowns, np.arange(u)] = 1.0
-        E[:, u:] = -through
+        # each dx as a linear function of the reduced unknowns: an unknown itself, or -L^-T Y' for a point
+        E[:, u:] = -self.optimum.equations.through(np.asarray(points))
         for s, j in enumerate(points):
             kept = np.flatnonzero(self.layout.kept == j)
             if len(kept):

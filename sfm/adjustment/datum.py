@@ -31,7 +31,7 @@ from scipy.linalg import qr
 from scipy.linalg.lapack import dgeqrf, dorgqr
 
 from sfm.adjustment.engine.collinearity import State
-from sfm.adjustment.engine.normals import Equations, solve_transposed, times_reduced
+from sfm.adjustment.engine.normals import NormalEquations, solve_transposed
 from sfm.adjustment.engine.observed import ObservedKind, reduced_rows
 from sfm.adjustment.engine.unknowns import Unknowns
 from sfm.model.conventions import BoolArray, FloatArray, IntArray
@@ -406,7 +406,7 @@ def leading(vectors: FloatArray) -> BoolArray:
 
 
 def with_further(
-    motions: Motions, further: FloatArray, equations: Equations, layout: Unknowns, datum: ResolvedDatum
+    motions: Motions, further: FloatArray, equations: NormalEquations, layout: Unknowns, datum: ResolvedDatum
 ) -> Motions:
     """Return the motions with further null vectors and the constraints on them.
 
@@ -420,11 +420,11 @@ def with_further(
     Raises:
         DivergedError: unknowns have become so large that their squares overflow.
     """
-    if further.shape[1] == 0 and not equations.blocks.held.any():
+    if further.shape[1] == 0 and not equations.held.any():
         return motions
-    blocks, scale = equations.blocks, equations.parts.scale[:, None]
+    scale, held = equations.scale[:, None], equations.held
     on = carriers(layout, datum)
-    loose = (blocks.held > 0) & ~on
+    loose = (held > 0) & ~on
     if loose.any():
         points = motions.points.copy()
         points[loose] = _moved_points(motions.reduced, equations, layout)[loose]
@@ -433,7 +433,7 @@ def with_further(
         return motions
     N = scale * further * layout.reduced_free()[:, None]
     N, moved = motions.transform(N, _moved_points(N, equations, layout))
-    whitened = np.swapaxes(blocks.L[on], 1, 2) @ moved[on]
+    whitened = np.swapaxes(equations.lower[on], 1, 2) @ moved[on]
     _, singular, Vt = np.linalg.svd(np.linalg.qr(whitened.reshape(3 * len(whitened), N.shape[1]), mode="r"))
     carried = int((singular > MIN_DATUM_EFFECT).sum())
     N, moved = N @ Vt.T, moved @ Vt.T
@@ -464,11 +464,9 @@ def with_further(
     )
 
 
-def _moved_points(N: FloatArray, equations: Equations, layout: Unknowns) -> FloatArray:
+def _moved_points(N: FloatArray, equations: NormalEquations, layout: Unknowns) -> FloatArray:
     """Return the displacements of object points by null vectors N of the reduced unknowns, (n, 3, e)."""
-    moved = np.empty((*layout.point_free.shape, N.shape[1]))
-    times_reduced(layout.observations, equations.blocks, np.ascontiguousarray(N), moved)
-    moved = -solve_transposed(equations.blocks.L, moved)
+    moved = -solve_transposed(equations.lower, equations.times_reduced(N))
     moved[layout.kept] = N[layout.kept_start :].reshape(len(layout.kept), 3, N.shape[1])
     return moved * layout.point_free[:, :, None]
 

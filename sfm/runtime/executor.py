@@ -1,12 +1,17 @@
-"""Interface of an engine, which distributes the work of a batch over processes and computers.
+"""Interfaces of what distributes work over processes and computers: an engine of batches, a keeper of blocks.
 
-A piece of work has parts, which run in parallel anywhere, and a whole, which is called with the results of
-the parts. Functions get an additional keyword `send`, with which they report during their work.
+A piece of work of a batch has parts, which run in parallel anywhere, and a whole, which is called with the
+results of the parts. Functions get an additional keyword `send`, with which they report during their work.
+
+The blocks of one large adjustment need their data again in every step. A keeper keeps the results of calls
+where they were computed, and gives them to later calls there.
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Callable, Iterable, Iterator, Sequence
+from contextlib import contextmanager
+from contextvars import ContextVar
 from dataclasses import dataclass
 from typing import Any, Protocol
 
@@ -77,3 +82,68 @@ class Engine(Protocol):
         Raises:
             BackendError: no worker is left.
         """
+
+
+class Keeper(Protocol):
+    """Runs calls in other processes, and keeps results there."""
+
+    @property
+    def workers(self) -> int:
+        """Number of calls that run at a time."""
+
+    def keep(self, calls: Sequence[Call]) -> list[Any]:
+        """Start calls and return where their results are kept, in order.
+
+        What is returned can be an argument of later calls, which get the result and run where it is. A result
+        that is lost with its worker is computed again. It is dropped with the last reference to it.
+
+        Args:
+            calls: functions without side effects, and their arguments.
+        """
+
+    def fetch(self, calls: Sequence[Call]) -> list[Any]:
+        """Return the results of calls, in order.
+
+        Raises:
+            BackendError: the processes are gone, or died repeatedly.
+        """
+
+
+class KeptHere:
+    """Keeper that computes everything in this process, one call after the other."""
+
+    workers = 1
+
+    def keep(self, calls: Sequence[Call]) -> list[Any]:
+        """Return the results of calls, see `Keeper.keep`."""
+        return [call.function(*call.arguments) for call in calls]
+
+    def fetch(self, calls: Sequence[Call]) -> list[Any]:
+        """Return the results of calls, see `Keeper.fetch`."""
+        return self.keep(calls)
+
+
+@dataclass(frozen=True)
+class Blocking:
+    """How large networks are adjusted in blocks."""
+
+    keeper: Keeper
+    blocks: int | None = None  # number of blocks of every network; None: one a worker, where that saves time
+
+
+_blocking: ContextVar[Blocking | None] = ContextVar("blocking", default=None)
+
+
+def current_blocking() -> Blocking | None:
+    """Return how networks are adjusted in blocks; None if they are adjusted in one piece."""
+    return _blocking.get()
+
+
+@contextmanager
+def in_blocks(blocking: Blocking) -> Iterator[None]:
+    """Adjust networks in blocks, in the processes of a keeper."""
+    token = _blocking.set(blocking)
+    try:
+        yield
+    finally:
+        _blocking.reset(token)

@@ -21,7 +21,7 @@ FRONTS = (
     fronts.distances,
     fronts._place,
     multifrontal._sum_front,
-    multifrontal._extend,
+    multifrontal.extend,
     multifrontal_factor._pick,
     multifrontal_factor._by_border,
     multifrontal_factor._sum_pairs,

@@ -48,7 +48,7 @@ def measured(network: Network, estimate: Estimate, way: object) -> tuple[float, 
         for counted in (False, True):  # compiled at first
             if counted:
                 tracemalloc.start()
-            inverse = solver.factor(equations, motions).inverse(equations.blocks, cross=False)
+            inverse = solver.factor(equations, motions).inverse(equations, cross=False)
     peak = tracemalloc.get_traced_memory()[1]
     tracemalloc.stop()
     results = (inverse.exterior, inverse.core, inverse.YQ_border)

@@ -72,11 +72,11 @@ def test_the_bottom_of_a_valley_is_reached_in_three_steps_or_not(monkeypatch: py
             vPv=heights[-1],
             factor=SimpleNamespace(solve=lambda along: along),
             motions=SimpleNamespace(transform=lambda z, Z: (z, Z)),
-            equations=None,
+            equations=SimpleNamespace(point_step=lambda _: np.zeros((1, 3))),
             reduced=np.ones(2),
             points=np.zeros((1, 3)),
         )
 
-    patched(monkeypatch, _solve=solve, point_step=lambda *_: np.zeros((1, 3)), total=lambda *_: float("inf"))
+    patched(monkeypatch, _solve=solve, total=lambda *_: float("inf"))
     assert iteration._along_valley(PROBLEM, None, np.ones(1), MOVE, 0.1) is None  # type: ignore[arg-type]
     assert len(heights) == 3

@@ -17,7 +17,7 @@ import numpy as np
 from sfm.adjustment.datum import leading
 from sfm.adjustment.engine.collinearity import Observations, State, Workspace, collinearity, new_workspace
 from sfm.adjustment.engine.iterate import Optimum
-from sfm.adjustment.engine.normals import solve_lower, solve_transposed, times_points, times_reduced
+from sfm.adjustment.engine.normals import solve_lower, solve_transposed
 from sfm.adjustment.engine.solvers.protocol import Inverse
 from sfm.adjustment.engine.unknowns import Unknowns
 from sfm.adjustment.result import Covariance
@@ -59,21 +59,21 @@ def cofactors(optimum: Optimum, layout: Unknowns, *, cross: bool = True) -> Cofa
         layout: order of the unknowns.
         cross: whether to compute cofactors between points and photographs; they are empty otherwise.
     """
-    b = optimum.equations.blocks
-    q = optimum.factor.inverse(b, cross=cross)
-    first = 6 * len(b.U)
-    Li = solve_lower(b.L, np.broadcast_to(np.eye(3), b.L.shape))
+    equations, L = optimum.equations, optimum.equations.lower
+    q = optimum.factor.inverse(equations, cross=cross)
+    first = layout.pose_free.size
+    Li = solve_lower(L, np.broadcast_to(np.eye(3), L.shape))
     limiting = np.asarray(np.swapaxes(Li, 1, 2) @ Li)
-    points = limiting + solve_transposed(b.L, np.swapaxes(solve_transposed(b.L, q.core), 1, 2))
-    for s, j in enumerate(layout.kept):
+    points = limiting + solve_transposed(L, np.swapaxes(solve_transposed(L, q.core), 1, 2))
+    for s, (j, V) in enumerate(zip(layout.kept, equations.normals_of(layout.kept), strict=True)):
         at = slice(layout.kept_start - first + 3 * s, layout.kept_start - first + 3 * s + 3)
         points[j] = q.border[at, at]
         # a kept point may have lost all its rays to the test; its limiting precision is then undefined
-        limiting[j] = np.linalg.inv(b.V[j]) if np.linalg.matrix_rank(b.V[j]) == 3 else 0.0
+        limiting[j] = np.linalg.inv(V) if np.linalg.matrix_rank(V) == 3 else 0.0
     mask = layout.point_free.astype(float)
     points *= mask[:, :, None] * mask[:, None, :]
     limiting *= mask[:, :, None] * mask[:, None, :]
-    rays, inner = _cross(layout, q, b.L, mask)
+    rays, inner = _cross(layout, q, L, mask)
     F_c, F_p, G = _datum_terms(optimum, layout, limiting)
     return Cofactors(q.exterior, q.border, q.mixed, points, limiting, rays, inner, F_c, F_p, G)
 
@@ -177,7 +177,7 @@ def without_held(covariance: Covariance, layout: Unknowns, optimum: Optimum) -> 
         layout: order of the unknowns.
         optimum: undamped normal equations, in which directions that the rays leave open were held.
     """
-    idle_point = ~layout.point_on | (optimum.equations.blocks.held > 0)
+    idle_point = ~layout.point_on | (optimum.equations.held > 0)
     idle_image = ~layout.image_on
     points, limiting = covariance.points.copy(), covariance.points_limiting.copy()
     exterior = covariance.exterior.copy()
@@ -232,22 +232,19 @@ def _datum_terms(
 
     In B of the motions, kept points appear among the points only.
     """
-    motions, b = optimum.motions, optimum.equations.blocks
-    n, d = len(b.L), len(motions.inverse)
+    motions, equations, L = optimum.motions, optimum.equations, optimum.equations.lower
+    d = len(motions.inverse)
     B = motions.constraints
     on_reduced = motions.on_reduced.copy()
     on_reduced[layout.kept_start :] += B[layout.kept].reshape(3 * len(layout.kept), d)
     eliminated = np.array(B)
     eliminated[layout.kept] = 0.0
     # B'Q_c = (B_c - Y L^-1 B_p)' S^-1
-    through = np.zeros((layout.reduced, d))
-    times_points(layout.observations, b, solve_lower(b.L, eliminated), through)
+    through = equations.times_points(solve_lower(L, eliminated))
     free = layout.reduced_free()[:, None]
     QB_c = optimum.factor.solve((on_reduced - through) * free) * free
     # Q_pp B_p = V^-1 B_p - L^-T Y' (Q_cp B_p), with Q_cp of all points together
-    YQB = np.empty((n, 3, d))
-    times_reduced(layout.observations, b, np.ascontiguousarray(QB_c), YQB)
-    QB_p = limiting @ eliminated - solve_transposed(b.L, YQB)
+    QB_p = limiting @ eliminated - solve_transposed(L, equations.times_reduced(QB_c))
     QB_p[layout.kept] = QB_c[layout.kept_start :].reshape(len(layout.kept), 3, d)
     QB_p *= layout.point_free[:, :, None]
     BQB = np.einsum("jad,jae->de", QB_p, eliminated) + QB_c.T @ on_reduced

@@ -373,8 +373,8 @@ def linearise(optimum: Optimum, layout: Unknowns, weight: FloatArray) -> Lineari
         layout: order of the unknowns.
         weight: factor on the weight of each image point, (k,).
     """
-    o, b = layout.observations, optimum.equations.blocks
-    k, n, f = len(o.image), len(b.L), int(o.free_count.max(initial=0))
+    o, L = layout.observations, optimum.equations.lower
+    k, n, f = len(o.image), len(L), int(o.free_count.max(initial=0))
     A, B = np.zeros((k, 2, 6 + f)), np.zeros((k, 2, 3))
     _fill(o, optimum.state, weight, new_workspace(), A, B)
     A[:, :, :6] *= layout.pose_free[o.pose][:, None]
@@ -389,7 +389,7 @@ def linearise(optimum: Optimum, layout: Unknowns, weight: FloatArray) -> Lineari
     of_kept = layout.kept_start + 3 * slot[o.point[kept]][:, None] + np.arange(3)
     by_kept = _of_rays(B[kept], of_kept, kept, layout.reduced)
     of_point = 3 * o.point[~kept][:, None] + np.arange(3)
-    half = solve_lower(b.L, np.tile(np.eye(3), (n, 1, 1)))
+    half = solve_lower(L, np.tile(np.eye(3), (n, 1, 1)))
     V_inverse = half.transpose(0, 2, 1) @ half
     F = np.zeros((k, 2, 2))
     F[:, 0, 0], F[:, 1, 0], F[:, 1, 1] = (o.whitening * np.sqrt(weight * o.share)[:, None]).T

@@ -18,15 +18,15 @@ Problems, sec. 2.1.2, for the simplified step.
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import NoReturn
+from typing import NoReturn, Protocol
 
 import numpy as np
 
 from sfm.adjustment.datum import Motions, ResolvedDatum, motions_of, on_sound_points, with_further
 from sfm.adjustment.engine.collinearity import State, sum_of_squares
-from sfm.adjustment.engine.normals import Equations, Space, new_space, normal_equations, point_step
-from sfm.adjustment.engine.observed import ObservedKind, couples_poses, vPv_of
-from sfm.adjustment.engine.solvers.choice import choose_solver
+from sfm.adjustment.engine.normals import NormalEquations, Space, new_space, normal_equations
+from sfm.adjustment.engine.observed import ObservedKind, coupled_poses, vPv_of
+from sfm.adjustment.engine.solvers.choice import blocks_of, choose_solver
 from sfm.adjustment.engine.solvers.dense import DenseSolver
 from sfm.adjustment.engine.solvers.protocol import Factor, Solver
 from sfm.adjustment.engine.unknowns import Unknowns, step
@@ -56,13 +56,46 @@ class Optimum:
     """Result of an iteration, with the undamped normal equations of its last step."""
 
     state: State
-    equations: Equations
+    equations: NormalEquations
     factor: Factor
     motions: Motions
     converged: bool
     iterations: int
     vPv: float
     start_vPv: float  # v'Pv at the start values
+
+
+class Former(Protocol):
+    """Forms the normal equations of one network."""
+
+    def normal_equations(self, state: State, weight: FloatArray, damping: float) -> NormalEquations:
+        """Return the normal equations at a state with object points eliminated.
+
+        Args:
+            state: values of all parameters.
+            weight: factor on the weight of each image point, (k,).
+            damping: share of its diagonal added to the whole normal matrix.
+        """
+
+    def vPv(self, state: State, weight: FloatArray) -> float:
+        """Return v'Pv of all observations; infinite if a point is behind a camera."""
+
+
+@dataclass(frozen=True)
+class InOnePiece:
+    """Forms the normal equations in this process."""
+
+    layout: Unknowns
+    observed: tuple[ObservedKind, ...]
+    space: Space  # memory of the normal equations, reused in every step
+
+    def normal_equations(self, state: State, weight: FloatArray, damping: float) -> NormalEquations:
+        """Return the normal equations at a state, see `Former.normal_equations`."""
+        return normal_equations(self.layout, self.observed, state, weight, damping=damping, space=self.space)
+
+    def vPv(self, state: State, weight: FloatArray) -> float:
+        """Return v'Pv of all observations; infinite if a point is behind a camera."""
+        return sum_of_squares(self.layout.observations, state, weight) + vPv_of(self.observed, state)
 
 
 @dataclass(frozen=True)
@@ -72,7 +105,7 @@ class Problem:
     layout: Unknowns  # order of the unknowns
     observed: tuple[ObservedKind, ...]  # observations other than image points
     datum: ResolvedDatum
-    space: Space  # memory of the normal equations, reused in every step
+    former: Former  # forms the normal equations
     solver: Solver  # solver of the reduced normal equations
 
 
@@ -90,7 +123,7 @@ class Move:
 class Step(Move):
     """A step with the normal equations that it comes from."""
 
-    equations: Equations
+    equations: NormalEquations
     factor: Factor
     motions: Motions
 
@@ -112,8 +145,11 @@ def problem_of(layout: Unknowns, observed: tuple[ObservedKind, ...], datum: Reso
         datum: kind and points.
     """
     keep_freed_memory()
-    solver = DenseSolver(layout) if couples_poses(observed) else choose_solver(layout)
-    return Problem(layout, observed, datum, new_space(layout), solver)
+    blocks = blocks_of(layout, observed)
+    if blocks is not None:
+        return Problem(layout, observed, datum, blocks, blocks)
+    solver = DenseSolver(layout) if len(coupled_poses(observed, layout)) else choose_solver(layout)
+    return Problem(layout, observed, datum, InOnePiece(layout, observed, new_space(layout)), solver)
 
 
 def iterate(
@@ -238,11 +274,11 @@ def _solve(
         tolerance: |A dx| / |v| of convergence.
     """
     p, layout = problem, problem.layout
-    equations = normal_equations(layout, p.observed, state, weight, damping=damping, space=p.space)
-    if equations.vPv > limit or not (np.isfinite(equations.vPv) and np.isfinite(equations.parts.g).all()):
+    equations = p.former.normal_equations(state, weight, damping)
+    if equations.vPv > limit or not (np.isfinite(equations.vPv) and np.isfinite(equations.g).all()):
         return None
     try:
-        motions = motions_of(layout, p.observed, state, on_sound_points(p.datum, equations.blocks.held))
+        motions = motions_of(layout, p.observed, state, on_sound_points(p.datum, equations.held))
     except GeometryError:  # the datum points have moved together during the iteration
         return None
     try:
@@ -262,15 +298,14 @@ def _solve(
     return None
 
 
-def _step(problem: Problem, equations: Equations, factor: Factor, motions: Motions) -> Step:
+def _step(problem: Problem, equations: NormalEquations, factor: Factor, motions: Motions) -> Step:
     layout = problem.layout
-    datum = on_sound_points(problem.datum, equations.blocks.held)
+    datum = on_sound_points(problem.datum, equations.held)
     motions = with_further(motions, factor.further, equations, layout, datum)
     with np.errstate(over="ignore", invalid="ignore"):  # an infinite step is refused by its sum of squares
-        reduced = -factor.solve(equations.parts.g)
-        points = point_step(equations, reduced, layout)
-        y = equations.blocks.y.ravel()
-        predicted = max(float(y @ y - equations.parts.g @ reduced), 0.0)
+        reduced = -factor.solve(equations.g)
+        points = equations.point_step(reduced)
+        predicted = max(equations.y_squared - float(equations.g @ reduced), 0.0)
         dx, dX = motions.transform(reduced, points)
     return Step(dx, dX, predicted, equations.vPv, equations, factor, motions)
 
@@ -310,8 +345,7 @@ def total(problem: Problem, state: State, weight: FloatArray) -> float:
         state: values of all parameters.
         weight: factor on the weight of each image point, (k,).
     """
-    p = problem
-    return sum_of_squares(p.layout.observations, state, weight) + vPv_of(p.observed, state)
+    return problem.former.vPv(state, weight)
 
 
 def _shorter_step(
@@ -383,8 +417,8 @@ def _along_valley(
         height = back.vPv
         with np.errstate(over="ignore", invalid="ignore"):  # as in `_step`
             z = back.factor.solve(along)
-            nothing = point_step(back.equations, np.zeros_like(z), problem.layout)
-            z, Z = back.motions.transform(z, point_step(back.equations, z, problem.layout) - nothing)
+            nothing = back.equations.point_step(np.zeros_like(z))
+            z, Z = back.motions.transform(z, back.equations.point_step(z) - nothing)
             part = float(along @ back.reduced) / float(along @ z)
             moved = step(problem.layout, moved, back.reduced - part * z, back.points - part * Z)
         if total(problem, moved, weight) <= allowed:

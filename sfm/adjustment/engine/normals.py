@@ -14,7 +14,8 @@ Source: Brown (1958, 1976); Mikhail, Bethel and McGlone (2001), sec. 5.8; Foerst
 
 from __future__ import annotations
 
-from typing import NamedTuple
+from dataclasses import dataclass
+from typing import NamedTuple, Protocol
 
 import numpy as np
 
@@ -28,10 +29,10 @@ from sfm.adjustment.engine.accumulate import (
     sum_poses,
 )
 from sfm.adjustment.engine.collinearity import Observations, State, new_workspace
-from sfm.adjustment.engine.observed import ObservedKind, Terms, terms_of
+from sfm.adjustment.engine.observed import GivenTerms, ObservedKind, terms_of
 from sfm.adjustment.engine.ordering import by_photograph
 from sfm.adjustment.engine.unknowns import Unknowns
-from sfm.model.conventions import BoolArray, FloatArray
+from sfm.model.conventions import BoolArray, FloatArray, IntArray
 from sfm.runtime.compiling import kernel
 from sfm.runtime.threads import at_once
 
@@ -58,13 +59,151 @@ class Parts(NamedTuple):
     scale: FloatArray  # 1/sqrt of the diagonal of U, (reduced,)
 
 
-class Equations(NamedTuple):
+class NormalEquations(Protocol):
+    """Normal equations at a state with object points eliminated, whoever keeps Y."""
+
+    @property
+    def vPv(self) -> float:
+        """Weighted sum of squares at the state; infinite if a point is behind a camera."""
+
+    @property
+    def g(self) -> FloatArray:
+        """Reduced right-hand side, (reduced,)."""
+
+    @property
+    def scale(self) -> FloatArray:
+        """1/sqrt of the diagonal of U, (reduced,)."""
+
+    @property
+    def held(self) -> IntArray:
+        """Number of directions of each point that had to be held, (n,)."""
+
+    @property
+    def y_squared(self) -> float:
+        """Y'y of the eliminated points."""
+
+    @property
+    def lower(self) -> FloatArray:
+        """Cholesky factors of V; unit matrix for kept points, (n, 3, 3)."""
+
+    def normals_of(self, points: IntArray) -> FloatArray:
+        """Return V of some object points before elimination, (p, 3, 3)."""
+
+    def point_step(self, reduced_step: FloatArray) -> FloatArray:
+        """Return the step of all object points that belongs to a step of the reduced unknowns, (n, 3)."""
+
+    def times_schur(self, x: FloatArray) -> FloatArray:
+        """Return S x with the undamped reduced normal matrix S, without forming S, (reduced, e)."""
+
+    def times_reduced(self, x: FloatArray) -> FloatArray:
+        """Return Y'x of vectors of the reduced unknowns (reduced, e), (n, 3, e)."""
+
+    def times_points(self, h: FloatArray) -> FloatArray:
+        """Return Y h of vectors of the object points (n, 3, e), (reduced, e)."""
+
+    def through(self, points: IntArray) -> FloatArray:
+        """Return Y L^-1, the effect of the reduced unknowns on some object points, (reduced, 3 p)."""
+
+
+@dataclass(frozen=True)
+class Equations:
     """Normal equations at a state, with object points eliminated but Y Y' not yet subtracted."""
 
+    layout: Unknowns
     blocks: Blocks
     parts: Parts
     damping: float  # share of its diagonal added to the whole normal matrix
     vPv: float  # weighted sum of squares at the state; infinite if a point is behind a camera
+
+    @property
+    def g(self) -> FloatArray:
+        """Reduced right-hand side, (reduced,)."""
+        return self.parts.g
+
+    @property
+    def scale(self) -> FloatArray:
+        """1/sqrt of the diagonal of U, (reduced,)."""
+        return self.parts.scale
+
+    @property
+    def held(self) -> IntArray:
+        """Number of directions of each point that had to be held, (n,)."""
+        return self.blocks.held
+
+    @property
+    def y_squared(self) -> float:
+        """Y'y of the eliminated points."""
+        y = self.blocks.y.ravel()
+        return float(y @ y)
+
+    @property
+    def lower(self) -> FloatArray:
+        """Cholesky factors of V; unit matrix for kept points, (n, 3, 3)."""
+        return self.blocks.L
+
+    def normals_of(self, points: IntArray) -> FloatArray:
+        """Return V of some object points before elimination, (p, 3, 3)."""
+        return self.blocks.V[points]
+
+    def point_step(self, reduced_step: FloatArray) -> FloatArray:
+        """Return the step of all object points that belongs to a step of the reduced unknowns.
+
+        Args:
+            reduced_step: step of the reduced unknowns, (reduced,).
+
+        Returns:
+            Steps, (n, 3).
+        """
+        layout, dX = self.layout, np.empty_like(self.blocks.y)
+        step_points(layout.observations, layout.point_free, self.blocks, reduced_step, dX)
+        if len(layout.kept):
+            dX[layout.kept] = (
+                reduced_step[layout.kept_start :].reshape(-1, 3) * layout.point_free[layout.kept]
+            )
+        return dX
+
+    def times_schur(self, x: FloatArray) -> FloatArray:
+        """Return S x with the undamped reduced normal matrix S, without forming S, (reduced, e).
+
+        Args:
+            x: vectors, (reduced, e).
+        """
+        b, parts = self.blocks, self.parts
+        first, e = 6 * len(b.U), x.shape[1]
+        product = -self.times_points(self.times_reduced(x))
+        product[:first] += (b.U @ x[:first].reshape(len(b.U), 6, e)).reshape(first, e)
+        product[:first] += parts.border @ x[first:]
+        product[first:] += parts.border.T @ x[:first] + parts.corner @ x[first:]
+        if parts.coupled is not None:
+            product[:first] += parts.coupled @ x[:first]
+        return product
+
+    def times_reduced(self, x: FloatArray) -> FloatArray:
+        """Return Y'x of vectors of the reduced unknowns (reduced, e), (n, 3, e)."""
+        out = np.empty((len(self.blocks.y), 3, x.shape[1]))
+        times_reduced(self.layout.observations, self.blocks, np.ascontiguousarray(x), out)
+        return out
+
+    def times_points(self, h: FloatArray) -> FloatArray:
+        """Return Y h of vectors of the object points (n, 3, e), (reduced, e)."""
+        out = np.zeros((self.layout.reduced, h.shape[2]))
+        times_points(self.layout.observations, self.blocks, np.ascontiguousarray(h), out)
+        return out
+
+    def through(self, points: IntArray) -> FloatArray:
+        """Return Y L^-1, the effect of the reduced unknowns on some object points, (reduced, 3 p)."""
+        b, observations, m = self.blocks, self.layout.observations, len(self.blocks.U)
+        through = np.zeros((self.layout.reduced, 3 * len(points)))
+        of_poses = through[: 6 * m].reshape(m, 6, -1)
+        of_interior = through[6 * m :][: b.Y_interior.shape[2]]
+        inverse = solve_lower(b.L[points], np.tile(np.eye(3), (len(points), 1, 1)))
+        for s, j in enumerate(points):
+            seen = slice(observations.start[j], observations.start[j + 1])
+            at = slice(3 * s, 3 * s + 3)
+            rays = np.swapaxes(b.Y[seen], 1, 2) @ inverse[s]
+            np.add.at(of_poses[:, :, at], observations.pose[seen], rays)
+            of_interior[:, at] = b.Y_interior[j].T @ inverse[s]
+        return through
 
 
 def normal_equations(
@@ -91,11 +230,28 @@ def normal_equations(
     b.V.fill(0.0)
     b.gp.fill(0.0)
     terms = terms_of(observed, layout, state, b.V, b.gp)
+    return reduced_to_orientations(layout, terms, state, weight, damping, space)
+
+
+def reduced_to_orientations(
+    layout: Unknowns, terms: GivenTerms, state: State, weight: FloatArray, damping: float, space: Space
+) -> Equations:
+    """Return the normal equations of image points and given terms, with object points eliminated.
+
+    Args:
+        layout: order of the unknowns.
+        terms: terms of observations other than image points; those of points are in V and gp of `space`.
+        state: values of all parameters.
+        weight: factor on the weight of each image point, (k,).
+        damping: share of its diagonal added to the whole normal matrix.
+        space: memory of the equations.
+    """
+    b = space.blocks
     slot = np.full(len(state.points), -1, dtype=np.int64)
     slot[layout.kept] = np.arange(len(layout.kept))
     vPv = _sum_photographs(layout, state, weight, space)
     eliminate_points(layout.observations, layout.point_free, slot, layout.kept_start, 1 + damping, b)
-    return Equations(b, _parts(layout, terms, b), damping, vPv + terms.vPv)
+    return Equations(layout, b, _parts(layout, terms, b), damping, vPv + terms.vPv)
 
 
 def _sum_photographs(layout: Unknowns, state: State, weight: FloatArray, space: Space) -> float:
@@ -122,7 +278,7 @@ def _sum_photographs(layout: Unknowns, state: State, weight: FloatArray, space: 
     return vPv
 
 
-def _parts(layout: Unknowns, terms: Terms, b: Blocks) -> Parts:
+def _parts(layout: Unknowns, terms: GivenTerms, b: Blocks) -> Parts:
     """Gather the blocks of interior unknowns, kept points and observations other than image points."""
     first = 6 * len(b.U)
     inner = layout.kept_start - first
@@ -147,44 +303,6 @@ def _parts(layout: Unknowns, terms: Terms, b: Blocks) -> Parts:
     with np.errstate(invalid="ignore"):  # equations that are not finite are refused when they are solved
         g -= b.Yy
     return Parts(border, corner, coupled, g, scale)
-
-
-def point_step(equations: Equations, reduced_step: FloatArray, layout: Unknowns) -> FloatArray:
-    """Return the step of all object points that belongs to a step of the reduced unknowns, (n, 3).
-
-    Args:
-        equations: normal equations.
-        reduced_step: step of the reduced unknowns, (reduced,).
-        layout: order of the unknowns.
-    """
-    dX = np.empty_like(equations.blocks.y)
-    step_points(layout.observations, layout.point_free, equations.blocks, reduced_step, dX)
-    if len(layout.kept):
-        dX[layout.kept] = reduced_step[layout.kept_start :].reshape(-1, 3) * layout.point_free[layout.kept]
-    return dX
-
-
-def times_schur(equations: Equations, layout: Unknowns, x: FloatArray) -> FloatArray:
-    """Return S x with the undamped reduced normal matrix S, without forming S, (reduced, e).
-
-    Args:
-        equations: normal equations.
-        layout: order of the unknowns.
-        x: vectors, (reduced, e).
-    """
-    b, parts = equations.blocks, equations.parts
-    first, e = 6 * len(b.U), x.shape[1]
-    x = np.ascontiguousarray(x)
-    through = np.empty((len(b.y), 3, e))
-    times_reduced(layout.observations, b, x, through)
-    product = np.empty_like(x)
-    product[:first] = (b.U @ x[:first].reshape(len(b.U), 6, e)).reshape(first, e) + parts.border @ x[first:]
-    product[first:] = parts.border.T @ x[:first] + parts.corner @ x[first:]
-    if parts.coupled is not None:
-        product[:first] += parts.coupled @ x[:first]
-    np.negative(through, out=through)
-    times_points(layout.observations, b, through, product)
-    return product
 
 
 def solve_lower(L: FloatArray, h: FloatArray) -> FloatArray:

@@ -12,7 +12,7 @@ squares).
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import NamedTuple
+from typing import NamedTuple, Protocol
 
 import numpy as np
 
@@ -176,6 +176,19 @@ def _of_block(block: Block, layout: Unknowns, state: State) -> tuple[IntArray, F
     return np.maximum(columns, 0), (columns >= 0).astype(float)[:, :, None]
 
 
+class GivenTerms(Protocol):
+    """Terms of the reduced normal equations that do not come from image points."""
+
+    @property
+    def vPv(self) -> float:
+        """V'Pv of their observations."""
+
+    def add_to(
+        self, U: FloatArray, border: FloatArray, corner: FloatArray, g: FloatArray
+    ) -> FloatArray | None:
+        """Add to the blocks of the reduced normal equations; arguments as in `Terms.add_to`."""
+
+
 @dataclass(frozen=True)
 class Terms:
     """Terms of the reduced normal equations, from observations that depend on more than one object point."""
@@ -247,8 +260,20 @@ def terms_of(
     return Terms(tuple(rows), vPv)
 
 
-def couples_poses(observed: tuple[ObservedKind, ...]) -> bool:
-    """Return whether any observations depend on two photographs each, which requires a full matrix."""
-    return any(
-        sum(block.of == PHOTOGRAPH for block in observed_kind.kind.blocks()) > 1 for observed_kind in observed
-    )
+def coupled_poses(observed: tuple[ObservedKind, ...], layout: Unknowns) -> IntArray:
+    """Return the poses that observations of several poses each couple with one another, (c,).
+
+    Args:
+        observed: kinds of observations.
+        layout: order of the unknowns.
+    """
+    coupled = [np.zeros(0, dtype=np.int64)]
+    for observed_kind in observed:
+        of = [block.at for block in observed_kind.kind.blocks() if block.of == PHOTOGRAPH]
+        if not of:
+            continue
+        poses = layout.observations.pose_of[np.stack(of, axis=1)]
+        if len(observed_kind.weight) != len(poses):  # mutually correlated observations are a single one
+            poses = poses.reshape(1, -1)
+        coupled.append(poses[(poses != poses[:, :1]).any(axis=1)].ravel())
+    return np.unique(np.concatenate(coupled))

@@ -13,7 +13,6 @@ import numpy as np
 
 from sfm.adjustment.datum import free_motions, leading
 from sfm.adjustment.engine.iterate import Optimum
-from sfm.adjustment.engine.normals import times_schur
 from sfm.adjustment.engine.unknowns import MIN_RAYS, Unknowns, interior_names
 from sfm.model.conventions import BoolArray, FloatArray
 from sfm.model.display import counted
@@ -37,7 +36,7 @@ def rank_defect(optimum: Optimum, layout: Unknowns) -> int:
         layout: order of the unknowns.
     """
     motions = null_motions(optimum, layout) + optimum.motions.further
-    return motions + int(optimum.equations.blocks.held.sum()) + layout.held_defect
+    return motions + int(optimum.equations.held.sum()) + layout.held_defect
 
 
 def null_motions(optimum: Optimum, layout: Unknowns) -> int:
@@ -53,8 +52,8 @@ def null_motions(optimum: Optimum, layout: Unknowns) -> int:
     d = optimum.motions.defect
     if d == 0:
         return 0
-    scale = optimum.equations.parts.scale[:, None]
-    H = optimum.motions.orthonormal(optimum.equations.parts.scale)
+    scale = optimum.equations.scale[:, None]
+    H = optimum.motions.orthonormal(optimum.equations.scale)
     together = H.sum(axis=1, keepdims=True) / np.sqrt(d)
     if _mapped_to_zero(optimum, layout, scale * together).all():
         return d
@@ -63,8 +62,8 @@ def null_motions(optimum: Optimum, layout: Unknowns) -> int:
 
 def _mapped_to_zero(optimum: Optimum, layout: Unknowns, H: FloatArray) -> BoolArray:
     """Return which columns of H, with scaled length 1, the reduced normal matrix maps to zero, (d,)."""
-    scale = optimum.equations.parts.scale[:, None]
-    NH = times_schur(optimum.equations, layout, H)
+    scale = optimum.equations.scale[:, None]
+    NH = optimum.equations.times_schur(H)
     return np.asarray(np.linalg.norm(scale * NH, axis=0) < MAPPED_TO_ZERO)
 
 
@@ -88,7 +87,7 @@ def undetermined_of(
         allowed_motions: defect that this kind of datum is expected to fix.
     """
     words = list(layout.held)
-    open_points = np.flatnonzero(optimum.equations.blocks.held)
+    open_points = np.flatnonzero(optimum.equations.held)
     rays = np.bincount(layout.observations.point[weight > 0], minlength=len(network.points))[open_points]
     words += [
         f"point {network.points[j]}: "
@@ -114,7 +113,7 @@ def describe_motions(optimum: Optimum, layout: Unknowns) -> str:
         optimum: undamped normal equations and their factor.
         layout: order of the unknowns.
     """
-    sound = optimum.equations.blocks.held == 0  # other points do not follow the motions
+    sound = optimum.equations.held == 0  # other points do not follow the motions
     d = optimum.motions.defect
     generators = free_motions(layout, optimum.state)[2][sound].reshape(-1, 7)
     opened = optimum.motions.points[sound, :, :d].reshape(-1, d)

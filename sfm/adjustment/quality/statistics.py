@@ -468,7 +468,7 @@ def _cofactors_of(rows: Reduced, optimum: Optimum, cofactors: Cofactors) -> Floa
     if (outer & (pose != lone[:, None])).any():  # several poses in one observation
         cofactors_of_rows = np.empty((n, d, d))
         for row in range(n):
-            right = np.zeros((d, len(optimum.equations.parts.scale)))
+            right = np.zeros((d, len(optimum.equations.scale)))
             np.add.at(right, (np.arange(d)[:, None], columns[row]), J[row])
             cofactors_of_rows[row] = right @ optimum.factor.solve(right.T)
         return cofactors_of_rows

@@ -15,15 +15,19 @@ import numpy as np
 from scipy.sparse import csr_matrix
 
 from sfm.adjustment.engine.collinearity import Observations
+from sfm.adjustment.engine.observed import ObservedKind, coupled_poses
 from sfm.adjustment.engine.solvers.dense import DenseSolver
 from sfm.adjustment.engine.solvers.fronts import BYTES, fronts_of, pairs_of
+from sfm.adjustment.engine.solvers.helmert import HelmertSolver
 from sfm.adjustment.engine.solvers.multifrontal import MultifrontalSolver
+from sfm.adjustment.engine.solvers.partition import partition_of
 from sfm.adjustment.engine.solvers.protocol import Solver, available_bytes, refuse_what_does_not_fit
 from sfm.adjustment.engine.unknowns import Unknowns
 from sfm.model.conventions import AnyArray, IntArray
 from sfm.model.display import counted
 from sfm.model.network import Network
 from sfm.runtime.compiling import compiled
+from sfm.runtime.executor import current_blocking
 
 # Operations per second, one thread, AVX-512 (OpenBLAS 0.3.30); only their ratios matter
 PRODUCT_RATE = 80e9  # symmetric product of full rows, mostly in single precision
@@ -73,6 +77,21 @@ def choose_solver(layout: Unknowns) -> Solver:
     if summed + fronts.operations / FRONT_RATE > full and fits:
         return dense()
     return MultifrontalSolver(layout, fronts)
+
+
+def blocks_of(layout: Unknowns, observed: tuple[ObservedKind, ...]) -> HelmertSolver | None:
+    """Return the solver in blocks where blocks are wanted and the network has them; None otherwise.
+
+    Args:
+        layout: order of the unknowns and the image points.
+        observed: observations other than image points.
+    """
+    blocking = current_blocking()
+    if blocking is None:
+        return None
+    count = blocking.keeper.workers if blocking.blocks is None else blocking.blocks
+    partition = partition_of(layout, count, coupled_poses(observed, layout))
+    return None if partition is None else HelmertSolver(layout, observed, partition, blocking.keeper)
 
 
 def refuse_too_large(network: Network) -> None:

@@ -134,9 +134,9 @@ class DenseFactor:
         W *= self.scale[:, None]
         return np.asarray(W)
 
-    def inverse(self, blocks: Blocks, *, cross: bool) -> Inverse:
+    def inverse(self, equations: Equations, *, cross: bool) -> Inverse:
         """Return the elements of the inverse; arguments as in `Factor.inverse`."""
-        b, layout = blocks, self.layout
+        b, layout = equations.blocks, self.layout
         m, n = len(b.U), len(b.y)
         W = self.inverse_root()
         free = layout.reduced_free()

@@ -142,15 +142,19 @@ def _bytes(front: Front) -> tuple[float, float, float]:
     return BYTES * size**2, BYTES * pivots * size, BYTES * (size - pivots) ** 2
 
 
-def fronts_of(observations: Observations, graph: csr_matrix) -> Fronts:
+def fronts_of(observations: Observations, graph: csr_matrix, last: int | None = None) -> Fronts:
     """Return the fronts of a network.
 
     Args:
         observations: image points.
         graph: nonzero where two photographs share an object point, symmetric, (m, m).
+        last: how many photographs, at the end of the numbers, form the last front, which may be none; any
+            may if it is not given.
     """
     m, n = graph.shape[0], len(observations.start) - 1
-    order = dissect(graph)
+    order = dissect(graph if last is None else graph[: m - last, : m - last])
+    if last is not None:
+        order = _before(order, m, last)
     begins = np.concatenate([[0], np.cumsum([len(group) for group in order.groups])])
     photograph = np.concatenate(order.groups)
     place = np.empty(m, dtype=np.int64)
@@ -217,9 +221,16 @@ def dissect(graph: csr_matrix) -> Dissection:
     return order
 
 
+def _before(order: Dissection, m: int, last: int) -> Dissection:
+    """Return the groups with a further one after all others, of the last photographs."""
+    root = len(order.groups)
+    parents = [root if parent < 0 else parent for parent in order.parents]
+    return Dissection([*order.groups, np.arange(m - last, m)], [*parents, -1])
+
+
 def _eliminate(graph: csr_matrix, photographs: IntArray, order: Dissection) -> list[int]:
     """Append the groups of some photographs to `order`, given their graph; return groups without a parent."""
-    halves = _split(graph) if len(photographs) > LEAF else None
+    halves = split(graph) if len(photographs) > LEAF else None
     if halves is None:
         order.groups.append(photographs)
         order.parents.append(-1)
@@ -238,8 +249,15 @@ def _eliminate(graph: csr_matrix, photographs: IntArray, order: Dissection) -> l
     return [len(order.groups) - 1]
 
 
-def _split(graph: csr_matrix) -> tuple[BoolArray, BoolArray, BoolArray] | None:
-    """Return two halves and the separator between them; None if no small separator is found."""
+def split(graph: csr_matrix) -> tuple[BoolArray, BoolArray, BoolArray] | None:
+    """Return two halves and the separator between them; None if no small separator is found.
+
+    Args:
+        graph: nonzero where two photographs share an object point, symmetric, (m, m).
+
+    Returns:
+        Which photographs belong to each, (m,).
+    """
     m = graph.shape[0]
     rows, columns = np.repeat(np.arange(m), np.diff(graph.indptr)), graph.indices
     best: tuple[BoolArray, BoolArray, BoolArray] | None = None

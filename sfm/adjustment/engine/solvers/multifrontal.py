@@ -23,9 +23,10 @@ Wilkinson (1965), The Algebraic Eigenvalue Problem, ch. 9 (inverse iteration).
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from collections.abc import Callable
+from dataclasses import dataclass
 from functools import cached_property
-from typing import NamedTuple
+from typing import NamedTuple, Protocol, Self, TypeVar
 
 import numpy as np
 from scipy.linalg import cho_factor, eigh, qr
@@ -34,7 +35,7 @@ from scipy.linalg.lapack import dpotrf
 
 from sfm.adjustment.datum import Motions
 from sfm.adjustment.engine.collinearity import Observations
-from sfm.adjustment.engine.normals import Equations, times_schur
+from sfm.adjustment.engine.normals import Equations, NormalEquations
 from sfm.adjustment.engine.solvers import protocol
 from sfm.adjustment.engine.solvers.dense import NULL, WEAK_PIVOT
 from sfm.adjustment.engine.solvers.fronts import BYTES, Front, Fronts, subtract_border
@@ -93,61 +94,27 @@ class MultifrontalSolver:
         protocol.refuse_what_does_not_fit(
             self.bytes, f"the unknowns of {len(self.layout.pose_free)} photographs", limit=self.limit
         )
-        scale = equations.parts.scale
-        Q = motions.orthonormal(scale)
-        fixed = _separating_rows(Q)
-        border = self._border(equations)
-        factor = self._factor_with_held(equations, border, fixed)
-        if damped or not (factor is None or factor.weak):
-            return factor
-        del factor  # only one factor at a time fits in memory
-        shifted = self._factor_with_held(equations, border, fixed, shift=SHIFT)
-        if shifted is None:
-            return self._factor_with_held(equations, border, fixed)
-        further = null_vectors(shifted, equations, self.layout, Q)
-        del shifted
-        if further.shape[1] == 0:
-            return self._factor_with_held(equations, border, fixed)
-        # held together with the motions, so that no unknown is chosen for two null vectors
-        factor = self._factor_with_held(equations, border, _separating_rows(np.hstack([Q, further])))
-        if factor is None:
-            return None
-        return replace(factor, further=refined(further, factor, equations, self.layout, Q))
-
-    def _border(self, equations: Equations) -> Border:
-        """Return the scaled border and corner."""
-        b, parts = equations.blocks, equations.parts
-        first, inner = 6 * len(b.U), b.Y_interior.shape[2]
-        C, D = parts.border.T.copy(), parts.corner.copy()
-        subtract_border(self.layout.observations, b.Y, b.Y_interior, C[:inner])
-        interior = b.Y_interior.reshape(3 * len(b.y), inner)
-        D[:inner, :inner] -= interior.T @ interior
-        C = C.T
-        s, sb = parts.scale[:first], parts.scale[first:]
-        C *= s[:, None] * sb
-        D *= sb[:, None] * sb
-        D[np.arange(len(D)), np.arange(len(D))] += equations.damping
-        return Border(C, D)
-
-    def _factor_with_held(
-        self,
-        equations: Equations,
-        border: Border,
-        fixed: IntArray,
-        *,
-        shift: float = 0.0,
-    ) -> MultifrontalFactor | None:
-        """Return the factor with some unknowns held; None if the matrix is not positive definite."""
         first = self.layout.pose_free.size
-        added = np.full(self.layout.reduced, shift)
-        added[fixed] += 1.0
-        eliminated = self._eliminate(equations, added[:first])
+        border = border_of(equations, equations.scale[:first], equations.scale[first:])
+        border.D[np.diag_indices_from(border.D)] += equations.damping
+
+        def factor_with(added: FloatArray) -> MultifrontalFactor | None:
+            return self._factor_with(equations, border, added)
+
+        return factor_with_null_space(factor_with, equations, motions, damped=damped)
+
+    def _factor_with(
+        self, equations: Equations, border: Border, added: FloatArray
+    ) -> MultifrontalFactor | None:
+        """Return the factor with `added` on the diagonal; None if it is not positive definite."""
+        layout, fronts, scale = self.layout, self.fronts, equations.scale
+        first = layout.pose_free.size
+        eliminated = eliminate_fronts(layout.observations, fronts, equations, scale, added[:first])
         if eliminated is None:
             return None
         weak = any(front.weakest**2 < WEAK_PIVOT for front in eliminated)
-        none = np.zeros((self.layout.reduced, 0))
-        scale = equations.parts.scale
-        factor = MultifrontalFactor(self.layout, self.fronts, scale, eliminated, border.C, none)
+        none = np.zeros((layout.reduced, 0))
+        factor = MultifrontalFactor(layout, fronts, scale, eliminated, border.C, none)
         X, corner = np.zeros((first, 0)), border.D + np.diag(added[first:])
         if len(border.D):
             X = factor.solve_exterior(border.C)
@@ -158,52 +125,165 @@ class MultifrontalSolver:
             weak = weak or bool(np.diagonal(corner).min() ** 2 < WEAK_PIVOT)
         return factor.with_border(X, corner, weak=weak)
 
-    def _eliminate(self, equations: Equations, added: FloatArray) -> list[EliminatedFront] | None:
-        """Eliminate all fronts, with `added` on the diagonal; None if one is not positive definite."""
-        fronts = self.fronts.fronts
-        eliminated: list[EliminatedFront | None] = [None] * len(fronts)
-        left: dict[int, FloatArray] = {}  # remainders for the parents
 
-        def eliminate(begin: int, end: int) -> bool:
-            space = np.empty(
-                max((36 * len(front.photographs) ** 2 for front in fronts[begin:end]), default=0)
-            )
-            for g in range(begin, end):
-                front = fronts[g]
-                F = self._front(equations, front, added, space)
-                for child in front.children:  # in this order for any number of threads
-                    _extend(left.pop(child), fronts[child].into, F)
-                pivots = 6 * front.pivots
-                U, info = dpotrf(F[:pivots, :pivots].T.copy(order="F"), lower=0, clean=1, overwrite_a=1)
-                if info != 0:
-                    return False
-                rest = F[pivots:, pivots:].copy()
-                K = F[pivots:, :pivots].copy()
-                if len(K):
-                    K = dtrsm(1.0, U, K.T, trans_a=1, overwrite_b=1).T
-                    rest = dsyrk(-1.0, K.T, beta=1.0, c=rest.T, trans=1, overwrite_c=1).T
-                eliminated[g], left[g] = EliminatedFront(U.T, K, float(np.diagonal(U).min())), rest
-            return True
+def border_of(equations: Equations, s: FloatArray, sb: FloatArray) -> Border:
+    """Return the scaled border and corner, with Y Y' subtracted and without damping.
 
-        half, end = self.fronts.halves
-        halves = at_once(lambda: eliminate(0, half), lambda: eliminate(half, end))
-        if not (all(halves) and eliminate(end, len(fronts))):
-            return None
-        return [front for front in eliminated if front is not None]
+    Args:
+        equations: normal equations.
+        s: scale of each exterior unknown, (6 m,).
+        sb: scale of each other reduced unknown, (i + 3 s,).
+    """
+    b, parts = equations.blocks, equations.parts
+    inner = b.Y_interior.shape[2]
+    C, D = parts.border.T.copy(), parts.corner.copy()
+    subtract_border(equations.layout.observations, b.Y, b.Y_interior, C[:inner])
+    interior = b.Y_interior.reshape(3 * len(b.y), inner)
+    D[:inner, :inner] -= interior.T @ interior
+    C = C.T
+    C *= s[:, None] * sb
+    D *= sb[:, None] * sb
+    return Border(C, D)
 
-    def _front(self, equations: Equations, front: Front, added: FloatArray, space: FloatArray) -> FloatArray:
-        """Return the scaled lower triangle of a front without remainders of children, stored in `space`."""
-        b, size = equations.blocks, 6 * len(front.photographs)
-        F = space[: size**2].reshape(size, size)
-        F.fill(0.0)
-        scale = equations.parts.scale[front.rows]
-        _sum_front(
-            self.layout.observations, b.U, b.Y, front.photographs[: front.pivots], front.points,
-            self.fronts.local, scale, F.reshape(-1),
-        )  # fmt: skip
-        each = np.arange(6 * front.pivots)
-        F[each, each] += equations.damping + added[front.rows[each]]  # the scaled diagonal of U is 1
-        return F
+
+class HeldFactor(Factor, Protocol):
+    """A factor that states whether a pivot is weak, and takes the null vectors that it holds."""
+
+    @property
+    def weak(self) -> bool:
+        """Whether a pivot is near 0."""
+
+    def with_further(self, further: FloatArray) -> Self:
+        """Return the factor with the null vectors that the datum does not explain, (reduced, e)."""
+
+
+F = TypeVar("F", bound=HeldFactor)
+
+
+def factor_with_null_space(
+    factor_with: Callable[[FloatArray], F | None],
+    equations: NormalEquations,
+    motions: Motions,
+    *,
+    damped: bool,
+) -> F | None:
+    """Return a factor that holds the motions and all further null vectors; None if there is none.
+
+    Args:
+        factor_with: returns the factor with some numbers added to the scaled diagonal, (reduced,).
+        equations: normal equations.
+        motions: null vectors that are motions.
+        damped: whether the equations are damped; then no further null vectors are sought.
+    """
+    Q = motions.orthonormal(equations.scale)
+
+    def held(vectors: FloatArray, shift: float = 0.0) -> F | None:
+        added = np.full(len(Q), shift)
+        added[_separating_rows(vectors)] += 1.0
+        return factor_with(added)
+
+    factor = held(Q)
+    if damped or not (factor is None or factor.weak):
+        return factor
+    del factor  # only one factor at a time fits in memory
+    shifted = held(Q, SHIFT)
+    if shifted is None:
+        return held(Q)
+    further = null_vectors(shifted, equations, Q)
+    del shifted
+    if further.shape[1] == 0:
+        return held(Q)
+    # held together with the motions, so that no unknown is chosen for two null vectors
+    factor = held(np.hstack([Q, further]))
+    return None if factor is None else factor.with_further(refined(further, factor, equations, Q))
+
+
+def eliminate_fronts(
+    observations: Observations,
+    fronts: Fronts,
+    equations: Equations,
+    scale: FloatArray,
+    added: FloatArray,
+) -> list[EliminatedFront] | None:
+    """Eliminate all fronts; None if one is not positive definite.
+
+    Args:
+        observations: image points.
+        fronts: the fronts in the order of elimination.
+        equations: normal equations.
+        scale: scale of each exterior unknown, (6 m,).
+        added: numbers to add to the scaled diagonal, (6 m,).
+    """
+    return eliminate_below(observations, fronts, len(fronts.fronts), equations, scale, added, {})
+
+
+def eliminate_below(
+    observations: Observations,
+    fronts: Fronts,
+    end: int,
+    equations: Equations,
+    scale: FloatArray,
+    added: FloatArray,
+    left: dict[int, FloatArray],
+) -> list[EliminatedFront] | None:
+    """Eliminate the fronts before `end`, and leave their remainders for the others in `left`."""
+    eliminated: list[EliminatedFront | None] = [None] * end
+    own = fronts.fronts[:end]
+
+    def eliminate(begin: int, stop: int) -> bool:
+        space = np.empty(max((36 * len(front.photographs) ** 2 for front in own[begin:stop]), default=0))
+        for g in range(begin, stop):
+            front = own[g]
+            F = sum_front(observations, fronts, front, equations, scale, space)
+            each = np.arange(6 * front.pivots)
+            F[each, each] += equations.damping + added[front.rows[each]]  # the scaled diagonal of U is 1
+            for child in front.children:  # in this order for any number of threads
+                extend(left.pop(child), own[child].into, F)
+            pivots = 6 * front.pivots
+            U, info = dpotrf(F[:pivots, :pivots].T.copy(order="F"), lower=0, clean=1, overwrite_a=1)
+            if info != 0:
+                return False
+            rest = F[pivots:, pivots:].copy()
+            K = F[pivots:, :pivots].copy()
+            if len(K):
+                K = dtrsm(1.0, U, K.T, trans_a=1, overwrite_b=1).T
+                rest = dsyrk(-1.0, K.T, beta=1.0, c=rest.T, trans=1, overwrite_c=1).T
+            eliminated[g], left[g] = EliminatedFront(U.T, K, float(np.diagonal(U).min())), rest
+        return True
+
+    half, stop = (min(place, end) for place in fronts.halves)
+    halves = at_once(lambda: eliminate(0, half), lambda: eliminate(half, stop))
+    if not (all(halves) and eliminate(stop, end)):
+        return None
+    return [front for front in eliminated if front is not None]
+
+
+def sum_front(
+    observations: Observations,
+    fronts: Fronts,
+    front: Front,
+    equations: Equations,
+    scale: FloatArray,
+    space: FloatArray,
+) -> FloatArray:
+    """Return the scaled lower triangle of a front without remainders of children, (6 f, 6 f).
+
+    Args:
+        observations: image points.
+        fronts: all fronts.
+        front: one of them.
+        equations: normal equations.
+        scale: scale of each exterior unknown, (6 m,).
+        space: memory for it, at least 36 f^2.
+    """
+    b, size = equations.blocks, 6 * len(front.photographs)
+    F = space[: size**2].reshape(size, size)
+    F.fill(0.0)
+    _sum_front(
+        observations, b.U, b.Y, front.photographs[: front.pivots], front.points, fronts.local,
+        scale[front.rows], F.reshape(-1),
+    )  # fmt: skip
+    return F
 
 
 def _separating_rows(vectors: FloatArray) -> IntArray:
@@ -243,8 +323,14 @@ def _sum_front(
 
 
 @kernel
-def _extend(rest: FloatArray, into: IntArray, F: FloatArray) -> None:
-    """Add the lower triangle of the remainder of a front to its parent."""
+def extend(rest: FloatArray, into: IntArray, F: FloatArray) -> None:
+    """Add the lower triangle of the remainder of a front to its parent.
+
+    Args:
+        rest: the remainder, (6 r, 6 r).
+        into: positions of its photographs in the parent, (r,).
+        F: matrix of the parent.
+    """
     for i in range(len(into)):
         for k in range(i + 1):
             for q in range(6):
@@ -253,23 +339,22 @@ def _extend(rest: FloatArray, into: IntArray, F: FloatArray) -> None:
                     row[6 * into[k] + p] += other[6 * k + p]
 
 
-def null_vectors(shifted: Factor, equations: Equations, layout: Unknowns, Q: FloatArray) -> FloatArray:
+def null_vectors(shifted: Factor, equations: NormalEquations, Q: FloatArray) -> FloatArray:
     """Return null vectors of the scaled matrix other than the motions, orthonormal, (reduced, e).
 
     Args:
         shifted: factor of the matrix with SHIFT added and the motions held.
         equations: normal equations.
-        layout: order of the unknowns.
         Q: motions, scaled and orthonormal, (reduced, d).
     """
-    scale = equations.parts.scale[:, None]
+    scale = equations.scale[:, None]
     sought = min(FIRST_SOUGHT, len(Q))
     while True:
         V = np.random.default_rng(0).standard_normal((len(Q), sought))
         for _ in range(STEPS):
             V = shifted.solve(_across(V, Q) / scale) / scale
         V = _across(V, Q)
-        values, vectors = eigh(V.T @ _times(equations, layout, V))
+        values, vectors = eigh(V.T @ _times(equations, V))
         null = values < NULL
         if not null.all() or sought == len(Q):
             return np.asarray(V @ vectors[:, null])
@@ -285,20 +370,17 @@ def search_bytes(layout: Unknowns) -> float:
     return BYTES * FIRST_SOUGHT * (3 * len(layout.point_free) + COPIES * layout.reduced)
 
 
-def refined(
-    vectors: FloatArray, held: Factor, equations: Equations, layout: Unknowns, Q: FloatArray
-) -> FloatArray:
+def refined(vectors: FloatArray, held: Factor, equations: NormalEquations, Q: FloatArray) -> FloatArray:
     """Return null vectors after removing remnants of other eigenvectors.
 
     Args:
         vectors: null vectors, scaled and orthonormal, (reduced, e).
         held: factor of the matrix in which they and the motions are held.
         equations: normal equations.
-        layout: order of the unknowns.
         Q: motions, scaled and orthonormal, (reduced, d).
     """
-    scale = equations.parts.scale[:, None]
-    return _across(vectors - held.solve(_times(equations, layout, vectors) / scale) / scale, Q)
+    scale = equations.scale[:, None]
+    return _across(vectors - held.solve(_times(equations, vectors) / scale) / scale, Q)
 
 
 def _across(V: FloatArray, Q: FloatArray) -> FloatArray:
@@ -306,7 +388,7 @@ def _across(V: FloatArray, Q: FloatArray) -> FloatArray:
     return np.asarray(np.linalg.qr(V - Q @ (Q.T @ V))[0])
 
 
-def _times(equations: Equations, layout: Unknowns, V: FloatArray) -> FloatArray:
+def _times(equations: NormalEquations, V: FloatArray) -> FloatArray:
     """Return S V with the scaled, undamped matrix S, (reduced, e)."""
-    scale = equations.parts.scale[:, None]
-    return scale * times_schur(equations, layout, scale * V)
+    scale = equations.scale[:, None]
+    return scale * equations.times_schur(scale * V)

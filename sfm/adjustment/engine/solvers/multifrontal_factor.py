@@ -12,7 +12,7 @@ Source: Takahashi, Fagan and Chin (1973), Formation of a sparse bus impedance ma
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, field, replace
 from typing import NamedTuple
 
@@ -21,8 +21,8 @@ from scipy.linalg import cho_solve
 from scipy.linalg.blas import dtrsm
 from scipy.linalg.lapack import dtrtri
 
-from sfm.adjustment.engine.accumulate import Blocks
 from sfm.adjustment.engine.collinearity import Observations
+from sfm.adjustment.engine.normals import Equations
 from sfm.adjustment.engine.solvers.fronts import Front, Fronts
 from sfm.adjustment.engine.solvers.protocol import Inverse
 from sfm.adjustment.engine.unknowns import Unknowns
@@ -80,85 +80,156 @@ class MultifrontalFactor:
             x[:first] -= self.X @ x[first:]
         return np.asarray((s * x).reshape(right.shape))
 
+    def with_further(self, further: FloatArray) -> MultifrontalFactor:
+        """Return the factor with the null vectors that it holds beside the motions.
+
+        Args:
+            further: scaled and orthonormal, (reduced, e).
+        """
+        return replace(self, further=further)
+
     def solve_exterior(self, right: FloatArray) -> FloatArray:
         """Return A^-1 right, scaled, (6 m, r)."""
         x = np.array(right, order="C")
-        pairs = list(zip(self.fronts.fronts, self.eliminated, strict=True))
-        for front, (L, K, _) in pairs:
-            pivots, rest = np.split(front.rows, [6 * front.pivots])
-            x[pivots] = dtrsm(1.0, L.T, x[pivots], trans_a=1)
-            if len(rest):
-                x[rest] -= K @ x[pivots]
-        for front, (L, K, _) in reversed(pairs):
-            pivots, rest = np.split(front.rows, [6 * front.pivots])
-            y = x[pivots] - K.T @ x[rest] if len(rest) else x[pivots]
-            x[pivots] = dtrsm(1.0, L.T, y)
+        eliminate_right(self.fronts, self.eliminated, x)
+        substitute_back(self.fronts, self.eliminated, x)
         return x
 
-    def inverse(self, blocks: Blocks, *, cross: bool) -> Inverse:
+    def inverse(self, equations: Equations, *, cross: bool) -> Inverse:
         """Return the elements of the inverse; arguments as in `Factor.inverse`.
 
         With Z = A^-1 within the fronts, X = A^-1 C and Q = (D - C' A^-1 C)^-1, the inverse is
         S^-1 = (Z + X Q X'   -X Q; -Q X'   Q).
         """
-        b, observations = blocks, self.layout.observations
         first, border = len(self.C), len(self.corner)
         scales = self.scale * self.layout.reduced_free()
         s, sb = scales[:first], scales[first:]
         X = self.X * s[:, None] / self.scale[first:]
         Q = cho_solve((self.corner, False), np.eye(border)) if border else np.zeros((0, 0))
         Q = np.ascontiguousarray(Q * sb[:, None] * sb)  # the kernel expects this layout
-        XQ = X @ Q
-        n, most = len(b.y), int(np.diff(observations.start).max())
-        core, exterior = np.zeros((n, 3, 3)), np.empty((len(b.U), 6, 6))
-        YQ = np.zeros((len(b.Y) if cross else most, 3, 6))
-        YQ_border = np.zeros((n if cross else 1, 3, border))
-        together = max(FEWEST_POINTS, MOST_VALUES // max(3 * border, 1))
-        for front, Z in self._inverse_fronts():
-            scale = s[front.rows]
-            Z_own = Z * scale
-            Z_own *= scale[:, None]
-            for i, photograph in enumerate(front.photographs[: front.pivots]):
-                at = slice(6 * i, 6 * i + 6)
-                rows = slice(6 * photograph, 6 * photograph + 6)
-                exterior[photograph] = Z_own[at, at] + XQ[rows] @ X[rows].T
-            for begin in range(0, len(front.points), together):
-                points = front.points[begin : begin + together]
-                u = np.empty((len(points), 3, border))
-                _by_border(observations, points, b.Y, b.Y_interior, X, u)
-                uQ = (u.reshape(3 * len(points), border) @ Q).reshape(u.shape)
-                _sum_pairs(
-                    observations, points, self.fronts.local, b.Y, b.Y_interior, Z_own.reshape(-1),
-                    len(Z_own), X, uQ, cross, core, YQ, YQ_border,
-                )  # fmt: skip
-        if not cross:
-            YQ, YQ_border = YQ[:0], YQ_border[:0]
-        return Inverse(exterior, -XQ, Q, core, YQ, YQ_border)
+        matrices = inverse_fronts(self.fronts, self.eliminated)
+        return inverse_of(matrices, self.fronts, equations, s, BorderInverse(X, Q), cross=cross)
 
-    def _inverse_fronts(self) -> Iterator[tuple[Front, FloatArray]]:
-        """Yield the fronts from the last to the first, with their elements of scaled A^-1."""
-        fronts = self.fronts.fronts
-        waiting = np.bincount([front.parent + 1 for front in fronts], minlength=len(fronts) + 1)[1:]
-        kept: dict[int, FloatArray] = {}
-        for g in range(len(fronts) - 1, -1, -1):
-            front, (L, K, _) = fronts[g], self.eliminated[g]
-            pivots, size = 6 * front.pivots, 6 * len(front.photographs)
-            inverse = np.tril(dtrtri(L.T, lower=0)[0].T)
-            Z = np.empty((size, size))
-            Z[:pivots, :pivots] = inverse.T @ inverse
-            if size > pivots:
-                _pick(kept[front.parent], front.into, Z[pivots:, pivots:])
-                G = K @ inverse
-                Z[pivots:, :pivots] = -(Z[pivots:, pivots:] @ G)
-                Z[:pivots, pivots:] = Z[pivots:, :pivots].T
-                Z[:pivots, :pivots] -= G.T @ Z[pivots:, :pivots]
-            if front.parent >= 0:
-                waiting[front.parent] -= 1
-                if waiting[front.parent] == 0:
-                    del kept[front.parent]
-            if waiting[g]:
-                kept[g] = Z
-            yield front, Z
+
+class BorderInverse(NamedTuple):
+    """What the elements of the inverse take from the unknowns other than exterior orientation."""
+
+    X: FloatArray  # A^-1 C in the units of the unknowns, (6 m, i + 3 s)
+    Q: FloatArray  # (D - C' A^-1 C)^-1, likewise, (i + 3 s, i + 3 s)
+
+
+def eliminate_right(fronts: Fronts, eliminated: Sequence[EliminatedFront], x: FloatArray) -> None:
+    """Eliminate right-hand sides front by front: x becomes L^-1 x, and what remains in later fronts.
+
+    Args:
+        fronts: the fronts.
+        eliminated: the first of them, which are eliminated.
+        x: right-hand sides, (6 m, r).
+    """
+    for front, (L, K, _) in zip(fronts.fronts, eliminated, strict=False):
+        pivots, rest = np.split(front.rows, [6 * front.pivots])
+        x[pivots] = dtrsm(1.0, L.T, x[pivots], trans_a=1)
+        if len(rest):
+            x[rest] -= K @ x[pivots]
+
+
+def substitute_back(fronts: Fronts, eliminated: Sequence[EliminatedFront], x: FloatArray) -> None:
+    """Substitute back front by front: eliminated right-hand sides become the solution.
+
+    Args:
+        fronts: the fronts.
+        eliminated: the first of them, which are eliminated.
+        x: eliminated right-hand sides, and the solution in later fronts, (6 m, r).
+    """
+    for front, (L, K, _) in reversed(list(zip(fronts.fronts, eliminated, strict=False))):
+        pivots, rest = np.split(front.rows, [6 * front.pivots])
+        y = x[pivots] - K.T @ x[rest] if len(rest) else x[pivots]
+        x[pivots] = dtrsm(1.0, L.T, y)
+
+
+def inverse_of(
+    matrices: Iterator[tuple[Front, FloatArray]],
+    fronts: Fronts,
+    equations: Equations,
+    scale: FloatArray,
+    by_border: BorderInverse,
+    *,
+    cross: bool,
+) -> Inverse:
+    """Return the elements of S^-1 of photographs, border and object points.
+
+    Args:
+        matrices: the fronts from the last to the first, with their elements of scaled A^-1.
+        fronts: all fronts.
+        equations: undamped normal equations.
+        scale: scale of each exterior unknown, 0 for fixed unknowns, (6 m,).
+        by_border: effect and inverse of the other unknowns.
+        cross: whether to compute Y'S^-1; it is empty otherwise.
+    """
+    b, observations, (X, Q) = equations.blocks, equations.layout.observations, by_border
+    border, XQ = len(Q), X @ Q
+    n, most = len(b.y), int(np.diff(observations.start).max())
+    core, exterior = np.zeros((n, 3, 3)), np.empty((len(b.U), 6, 6))
+    YQ = np.zeros((len(b.Y) if cross else most, 3, 6))
+    YQ_border = np.zeros((n if cross else 1, 3, border))
+    together = max(FEWEST_POINTS, MOST_VALUES // max(3 * border, 1))
+    for front, Z in matrices:
+        of_front = scale[front.rows]
+        Z_own = Z * of_front
+        Z_own *= of_front[:, None]
+        for i, photograph in enumerate(front.photographs[: front.pivots]):
+            at = slice(6 * i, 6 * i + 6)
+            rows = slice(6 * photograph, 6 * photograph + 6)
+            exterior[photograph] = Z_own[at, at] + XQ[rows] @ X[rows].T
+        for begin in range(0, len(front.points), together):
+            points = front.points[begin : begin + together]
+            u = np.empty((len(points), 3, border))
+            _by_border(observations, points, b.Y, b.Y_interior, X, u)
+            uQ = (u.reshape(3 * len(points), border) @ Q).reshape(u.shape)
+            _sum_pairs(
+                observations, points, fronts.local, b.Y, b.Y_interior, Z_own.reshape(-1), len(Z_own), X, uQ,
+                cross, core, YQ, YQ_border,
+            )  # fmt: skip
+    if not cross:
+        YQ, YQ_border = YQ[:0], YQ_border[:0]
+    return Inverse(exterior, -XQ, Q, core, YQ, YQ_border)
+
+
+def inverse_fronts(
+    fronts: Fronts, eliminated: Sequence[EliminatedFront], root: FloatArray | None = None
+) -> Iterator[tuple[Front, FloatArray]]:
+    """Yield the fronts from the last to the first, with their elements of scaled A^-1.
+
+    Args:
+        fronts: the fronts.
+        eliminated: those that were eliminated, all or all but the last.
+        root: elements of A^-1 of the last front if it was not eliminated, (6 r, 6 r).
+    """
+    tree = fronts.fronts
+    waiting = np.bincount([front.parent + 1 for front in tree], minlength=len(tree) + 1)[1:]
+    kept: dict[int, FloatArray] = {}
+    if root is not None:
+        kept[len(tree) - 1] = root
+        yield tree[-1], root
+    for g in range(len(eliminated) - 1, -1, -1):
+        front, (L, K, _) = tree[g], eliminated[g]
+        pivots, size = 6 * front.pivots, 6 * len(front.photographs)
+        inverse = np.tril(dtrtri(L.T, lower=0)[0].T)
+        Z = np.empty((size, size))
+        Z[:pivots, :pivots] = inverse.T @ inverse
+        if size > pivots:
+            _pick(kept[front.parent], front.into, Z[pivots:, pivots:])
+            G = K @ inverse
+            Z[pivots:, :pivots] = -(Z[pivots:, pivots:] @ G)
+            Z[:pivots, pivots:] = Z[pivots:, :pivots].T
+            Z[:pivots, :pivots] -= G.T @ Z[pivots:, :pivots]
+        if front.parent >= 0:
+            waiting[front.parent] -= 1
+            if waiting[front.parent] == 0:
+                del kept[front.parent]
+        if waiting[g]:
+            kept[g] = Z
+        yield front, Z
 
 
 @kernel

@@ -9,11 +9,9 @@ from __future__ import annotations
 import os
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Protocol
+from typing import Any, Protocol
 
 from sfm.adjustment.datum import Motions
-from sfm.adjustment.engine.accumulate import Blocks
-from sfm.adjustment.engine.normals import Equations
 from sfm.model.conventions import FloatArray
 from sfm.model.errors import GeometryError
 
@@ -49,11 +47,11 @@ class Factor(Protocol):
     def solve(self, right: FloatArray) -> FloatArray:
         """Return a solution of S x = right for right-hand sides (reduced,) or (reduced, r)."""
 
-    def inverse(self, blocks: Blocks, *, cross: bool) -> Inverse:
+    def inverse(self, equations: Any, *, cross: bool) -> Inverse:
         """Return the elements of the inverse.
 
         Args:
-            blocks: blocks of the undamped normal equations.
+            equations: the undamped normal equations that were factored.
             cross: whether to compute Y'S^-1; it is empty otherwise.
         """
 
@@ -70,12 +68,12 @@ class Solver(Protocol):
         """Peak memory of factor and inverse without the results, bytes; a second thread takes 0.05 GB."""
 
     def factor(
-        self, equations: Equations, motions: Motions, *, damped: bool = False, coarse: bool = False
+        self, equations: Any, motions: Motions, *, damped: bool = False, coarse: bool = False
     ) -> Factor | None:
         """Return the factored reduced normal equations; None if they are not positive definite.
 
         Args:
-            equations: normal equations with object points eliminated.
+            equations: normal equations with object points eliminated, of the kind that the solver takes.
             motions: null vectors that are motions, with their datum constraints.
             damped: whether the equations are damped; then no further null vectors are sought.
             coarse: whether to use single precision, for an intermediate step; the result is None if a pivot

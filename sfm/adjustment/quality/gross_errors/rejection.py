@@ -186,7 +186,7 @@ class Run:
             weight: factor on the weight of each image point, (k,).
         """
         held = len(optimum.motions.inverse)
-        held += int(optimum.equations.blocks.held.sum())
+        held += int(optimum.equations.held.sum())
         observations = 2 * int((weight > 0).sum()) + count_of(self.problem.observed)
         return observations - self.problem.layout.count + held
 
