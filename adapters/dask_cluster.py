@@ -1,4 +1,4 @@
-"""Dask as the engine of batches: a cluster on this computer, or any running scheduler.
+"""Dask as the engine of batches and the keeper of blocks: a cluster on this computer, or a running scheduler.
 
 Source: dask.distributed, Client futures API (https://distributed.dask.org/en/stable/client.html).
 """
@@ -10,12 +10,13 @@ import gc
 import logging
 import queue
 import signal
+import sys
 import time
 import uuid
-from collections.abc import Iterable, Iterator
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from concurrent.futures import CancelledError
 from contextlib import AbstractContextManager, ExitStack, contextmanager, suppress
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from itertools import count
 from multiprocessing import resource_tracker
 from threading import Lock
@@ -32,6 +33,7 @@ from dask.distributed import (
     Worker,
     WorkerPlugin,
     get_worker,
+    wait,
 )
 from distributed.core import rpc
 from distributed.security import Security
@@ -39,7 +41,7 @@ from threadpoolctl import threadpool_limits
 
 from sfm.files.user_cache import scratch_folder
 from sfm.model.errors import BackendError, KolinearError
-from sfm.runtime.executor import Call, Done, Event, Lost, Sent, Work
+from sfm.runtime.executor import Call, Done, Event, Lost, Sent, Work, WorkerLost
 
 # Worker deaths that Dask allows a call: one may be bad luck, and the call is tried on another worker.
 ALLOWED_FAILURES = 1
@@ -48,6 +50,11 @@ CONNECT_SECONDS = 5.0
 NOBODY_SECONDS = 60.0  # without any worker before a run gives up; starting a new one takes about 3 s
 LOOK_SECONDS = 2.0
 CLOSE_SECONDS = 5.0
+EVERYTHING = "all"  # topic of what happens to workers
+GONE, BATCH_AGAIN = "the Dask scheduler is gone", "run again with --resume"
+ADJUSTMENT_AGAIN = "run again, the result will be the same"
+DIED = "worker processes died, out of memory or by a fault in a library"
+LACKING = "the workers of the cluster lack what Kolinear needs"
 # Numerical libraries read these thread limits when a process starts.
 ONE_THREAD = dict.fromkeys(
     (
@@ -131,7 +138,7 @@ def local_engine(workers: int) -> Iterator[DaskEngine]:
             client.register_plugin(_LocalWorker())
             # it would still list its pages, even if it does not show them
             client.run_on_scheduler(lambda dask_scheduler: dask_scheduler.http_server.stop())
-        yield DaskEngine(client)
+        yield stack.enter_context(_engine_of(client))
 
 
 def _silence() -> None:
@@ -206,8 +213,25 @@ def _connected(address: str) -> Iterator[DaskEngine]:
         client = Client(address, timeout=CONNECT_SECONDS, set_as_default=False)
     except (OSError, ValueError, TypeError, TimeoutError) as error:
         raise BackendError(f"--cluster {address}: no Dask scheduler answers ({_line(error)})") from error
-    with client:
-        yield DaskEngine(client)
+    with client, _engine_of(client) as engine:
+        yield engine
+
+
+@contextmanager
+def _engine_of(client: Client) -> Iterator[DaskEngine]:
+    """Return the engine of a cluster, which learns of the workers that are lost."""
+    engine = DaskEngine(client)
+
+    def note(event: tuple[float, dict[str, Any]]) -> None:
+        if event[1].get("action") == "remove-worker" and not event[1]["expected"]:
+            engine.losses.put(str(event[1]["worker"]))
+
+    client.subscribe_topic(EVERYTHING, note)
+    try:
+        yield engine
+    finally:
+        with suppress(Exception):  # a scheduler that is gone cannot be asked
+            client.unsubscribe_topic(EVERYTHING)
 
 
 class _LocalWorker(WorkerPlugin):
@@ -221,11 +245,17 @@ class _LocalWorker(WorkerPlugin):
         worker.http_server.stop()
 
 
+def _to_standard_error(line: str) -> None:
+    print(line, file=sys.stderr)
+
+
 @dataclass(frozen=True)
 class DaskEngine:
-    """Runs work in the processes of a Dask cluster."""
+    """Runs work in the processes of a Dask cluster, and keeps results there."""
 
     client: Client
+    losses: queue.SimpleQueue[str] = field(default_factory=queue.SimpleQueue)  # workers that were lost
+    say: Callable[[str], None] = _to_standard_error  # receives a line for each worker lost by a keeper
 
     @property
     def workers(self) -> int:
@@ -256,12 +286,14 @@ class DaskEngine:
             while True:
                 while len(running) < at_a_time and (work := next(left, None)) is not None:
                     start(work)
+                for worker in self._lost_workers():
+                    yield WorkerLost(worker)
                 if not running:
                     return
                 try:
                     kind, what = events.get(timeout=LOOK_SECONDS)
                 except queue.Empty:
-                    someone = self._last_seen(someone)
+                    someone = self._last_seen(someone, BATCH_AGAIN)
                     continue
                 if kind == "sent":
                     yield Sent(what["key"], what["message"])
@@ -293,15 +325,76 @@ class DaskEngine:
         parts = [submit(part, "part") for part in work.parts]
         return [submit(work.whole, "whole", parts), *parts]
 
-    def _last_seen(self, someone: float) -> float:
+    def keep(self, calls: Sequence[Call]) -> list[Future[Any]]:
+        """Start calls and return where their results are kept, see sfm.runtime.executor.Keeper.
+
+        Calls that take nothing kept go to one worker after the other; all others follow their data.
+        """
+        try:
+            workers = sorted(self.client.nthreads())
+        except OSError as error:
+            raise BackendError(f"{GONE}; {ADJUSTMENT_AGAIN}") from error
+        futures = []
+        with dask.config.set({"distributed.admin.large-graph-warning-threshold": f"{sys.maxsize}B"}):
+            for place, call in enumerate(calls):
+                begins = not any(isinstance(argument, Future) for argument in call.arguments)
+                where = [workers[place % len(workers)]] if begins and workers else None
+                futures.append(
+                    self.client.submit(
+                        _in_one_thread,
+                        call.function,
+                        *call.arguments,
+                        key=f"block-{uuid.uuid4().hex}",
+                        workers=where,
+                        allow_other_workers=where is not None,
+                        pure=False,
+                    )
+                )
+        return futures
+
+    def fetch(self, calls: Sequence[Call]) -> list[Any]:
+        """Return the results of calls, see sfm.runtime.executor.Keeper.
+
+        Raises:
+            BackendError: the scheduler or all workers are gone, workers died repeatedly, or lack Kolinear.
+            KolinearError: an error raised by a called function.
+        """
+        try:
+            futures = self.keep(calls)
+            someone, waiting = time.monotonic(), True
+            while waiting:
+                try:
+                    wait(futures, timeout=LOOK_SECONDS)
+                    waiting = False
+                except TimeoutError:
+                    someone = self._last_seen(someone, ADJUSTMENT_AGAIN)
+                for worker in self._lost_workers():
+                    self.say(f"worker {worker} was lost; the others compute its blocks again")
+            return list(self.client.gather(futures))
+        except CancelledError as error:
+            raise BackendError(f"{GONE} or has dropped the work; {ADJUSTMENT_AGAIN}") from error
+        except KilledWorker as error:
+            raise BackendError(
+                f"{DIED} with a block of the network; use workers with more memory, or more of them"
+            ) from error
+        except ImportError as error:
+            raise BackendError(f"{LACKING}: {_line(error)}") from error
+
+    def _lost_workers(self) -> Iterator[str]:
+        """Yield the workers that were lost since the last look."""
+        with suppress(queue.Empty):
+            while True:
+                yield self.losses.get_nowait()
+
+    def _last_seen(self, someone: float, again: str) -> float:
         """Return when a worker was last seen; raise BackendError if that is too long ago."""
         try:
             if self.client.status not in ("running", "connecting"):
-                raise BackendError("the Dask scheduler is gone; run again with --resume")
+                raise BackendError(f"{GONE}; {again}")
             if self.client.nthreads():
                 return time.monotonic()
         except OSError as error:
-            raise BackendError("the Dask scheduler is gone; run again with --resume") from error
+            raise BackendError(f"{GONE}; {again}") from error
         if time.monotonic() - someone > NOBODY_SECONDS:
             raise BackendError(f"the Dask scheduler has had no worker for {NOBODY_SECONDS:.0f} s")
         return someone
@@ -321,6 +414,12 @@ def _call(call: Call, parts: list[Any] | None = None, *, topic: str, work: str) 
     finally:
         if parts is not None:
             gc.collect()  # figures are full of reference cycles, which Python collects late: 1 MiB a survey
+
+
+def _in_one_thread(function: Callable[..., Any], *arguments: Any) -> Any:
+    """Run a call of a keeper in a worker, with its libraries limited to one thread each."""
+    with _HELD:
+        return function(*arguments)
 
 
 class _OneThread:
@@ -362,15 +461,13 @@ def _event(key: str, future: Future[Any]) -> Event:
     try:
         return Done(key, future.result())
     except CancelledError as error:
-        raise BackendError(
-            "the Dask scheduler is gone or has dropped the work; run again with --resume"
-        ) from error
+        raise BackendError(f"{GONE} or has dropped the work; {BATCH_AGAIN}") from error
     except KilledWorker:
-        return Lost(key, "worker processes died, out of memory or by a fault in a library")
+        return Lost(key, DIED)
     except KolinearError:
         raise
     except ImportError as error:
-        raise BackendError(f"the workers of the cluster lack what Kolinear needs: {_line(error)}") from error
+        raise BackendError(f"{LACKING}: {_line(error)}") from error
     except Exception as error:
         return Lost(key, f"it failed in its worker: {type(error).__name__}: {_line(error)}")
 

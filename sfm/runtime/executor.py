@@ -59,7 +59,14 @@ class Lost:
     reason: str  # one line
 
 
-Event = Sent | Done | Lost
+@dataclass(frozen=True)
+class WorkerLost:
+    """A worker process was lost; what it was doing is done again by others."""
+
+    worker: str  # its address
+
+
+Event = Sent | Done | Lost | WorkerLost
 
 
 class Engine(Protocol):

@@ -44,7 +44,7 @@ from sfm.products.drafting.draft import has_photographs
 from sfm.products.drafting.frames_folder import videos_of
 from sfm.report.output import SurveyLog, folder_name, refuse_other_log, remove_log
 from sfm.report.viewer.pictures import BUDGET_MB
-from sfm.runtime.executor import Call, Done, Engine, Lost, Sent, Work
+from sfm.runtime.executor import Call, Done, Engine, Lost, Sent, Work, WorkerLost
 from sfm.runtime.forecast import Work as Extent
 from sfm.survey.inputs.measurements import NO_PHOTOGRAPHS, find_photographs, masks_of, work_of
 from sfm.survey.inputs.named_folders import named_folder
@@ -334,6 +334,8 @@ def _run(
                 watch.received(event.key, event.message)
             elif isinstance(event, Done):
                 finish(event.key, event.value)
+            elif isinstance(event, WorkerLost):
+                watch.remark(f"worker {event.worker} was lost; the others do its work again")
             else:
                 yield event
 
