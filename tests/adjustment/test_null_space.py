@@ -31,7 +31,7 @@ APART = np.array([1000.0, 0.0, 0.0])  # of two halves
 
 
 def in_fronts(layout: Unknowns) -> MultifrontalSolver:
-    m = len(layout.observations.camera)
+    m = layout.observations.poses
     joined = np.zeros((m, m), dtype=np.uint8)
     choice._join(layout.observations, np.arange(len(layout.observations.start) - 1), joined)
     return MultifrontalSolver(layout, fronts_of(layout.observations, csr_matrix(joined)))
