@@ -13,7 +13,7 @@ import signal
 import sys
 import time
 import uuid
-from collections.abc import Callable, Iterable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator
 from concurrent.futures import CancelledError
 from contextlib import AbstractContextManager, ExitStack, contextmanager, suppress
 from dataclasses import dataclass, field
@@ -325,7 +325,7 @@ class DaskEngine:
         parts = [submit(part, "part") for part in work.parts]
         return [submit(work.whole, "whole", parts), *parts]
 
-    def keep(self, calls: Sequence[Call]) -> list[Future[Any]]:
+    def keep(self, calls: Iterable[Call]) -> list[Future[Any]]:
         """Start calls and return where their results are kept, see sfm.runtime.executor.Keeper.
 
         Calls that take nothing kept go to one worker after the other; all others follow their data.
@@ -352,7 +352,7 @@ class DaskEngine:
                 )
         return futures
 
-    def fetch(self, calls: Sequence[Call]) -> list[Any]:
+    def fetch(self, calls: Iterable[Call]) -> list[Any]:
         """Return the results of calls, see sfm.runtime.executor.Keeper.
 
         Raises:

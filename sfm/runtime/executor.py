@@ -9,7 +9,7 @@ where they were computed, and gives them to later calls there.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator
 from contextlib import contextmanager
 from contextvars import ContextVar
 from dataclasses import dataclass
@@ -98,7 +98,7 @@ class Keeper(Protocol):
     def workers(self) -> int:
         """Number of calls that run at a time."""
 
-    def keep(self, calls: Sequence[Call]) -> list[Any]:
+    def keep(self, calls: Iterable[Call]) -> list[Any]:
         """Start calls and return where their results are kept, in order.
 
         What is returned can be an argument of later calls, which get the result and run where it is. A result
@@ -108,7 +108,7 @@ class Keeper(Protocol):
             calls: functions without side effects, and their arguments.
         """
 
-    def fetch(self, calls: Sequence[Call]) -> list[Any]:
+    def fetch(self, calls: Iterable[Call]) -> list[Any]:
         """Return the results of calls, in order.
 
         Raises:
@@ -121,11 +121,11 @@ class KeptHere:
 
     workers = 1
 
-    def keep(self, calls: Sequence[Call]) -> list[Any]:
+    def keep(self, calls: Iterable[Call]) -> list[Any]:
         """Return the results of calls, see `Keeper.keep`."""
         return [call.function(*call.arguments) for call in calls]
 
-    def fetch(self, calls: Sequence[Call]) -> list[Any]:
+    def fetch(self, calls: Iterable[Call]) -> list[Any]:
         """Return the results of calls, see `Keeper.fetch`."""
         return self.keep(calls)
 

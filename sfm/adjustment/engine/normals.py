@@ -339,7 +339,7 @@ def new_space(layout: Unknowns) -> Space:
     Args:
         layout: order of the unknowns.
     """
-    m, n, k = len(layout.image_on), len(layout.point_free), len(layout.order)
+    m, n, k = len(layout.image_on), len(layout.point_free), len(layout.observations.point)
     a, poses = len(layout.interior_free), len(layout.pose_free)
     f = int(layout.observations.free_count.max())
     order, first = by_photograph(layout.observations.image, m)

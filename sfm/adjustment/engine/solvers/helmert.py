@@ -22,7 +22,7 @@ Redefinition of North American Geodetic Networks; Erisman and Tinney (1975), Com
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass, field, replace
 from functools import cached_property
 from typing import Any, NamedTuple
@@ -39,7 +39,7 @@ from sfm.adjustment.engine.solvers import protocol
 from sfm.adjustment.engine.solvers.dense import WEAK_PIVOT
 from sfm.adjustment.engine.solvers.fronts import BYTES
 from sfm.adjustment.engine.solvers.multifrontal import factor_with_null_space
-from sfm.adjustment.engine.solvers.partition import Partition, Piece, added_at
+from sfm.adjustment.engine.solvers.partition import Partition, Piece, added_at, layout_of
 from sfm.adjustment.engine.solvers.protocol import Inverse
 from sfm.adjustment.engine.unknowns import Unknowns
 from sfm.model.conventions import BoolArray, FloatArray, IntArray
@@ -92,18 +92,19 @@ class HelmertSolver:
         """The blocks."""
         return self.partition.pieces
 
-    def each(self, function: Callable[..., Any], arguments: Sequence[tuple[Any, ...]]) -> list[Any]:
+    def each(self, function: Callable[..., Any], arguments: Iterable[tuple[Any, ...]]) -> list[Any]:
         """Return the results of a function of each block."""
-        return self.keeper.fetch([Call(function, given) for given in arguments])
+        return self.keeper.fetch(Call(function, given) for given in arguments)
 
-    def kept(self, function: Callable[..., Any], arguments: Sequence[tuple[Any, ...]]) -> list[Any]:
+    def kept(self, function: Callable[..., Any], arguments: Iterable[tuple[Any, ...]]) -> list[Any]:
         """Compute a function of each block, and return where its results are kept."""
-        return self.keeper.keep([Call(function, given) for given in arguments])
+        return self.keeper.keep(Call(function, given) for given in arguments)
 
     def _blocks(self) -> list[Any]:
         """Return where the blocks are kept; the image points are sent in the first step only."""
         if "blocks" not in self.sent:
-            given = [(piece.layout, piece.inner) for piece in self.pieces]
+            # one block after the other, since their image points are as large as those of the network
+            given = ((layout_of(self.layout, piece), piece.inner) for piece in self.pieces)
             self.sent["blocks"] = self.kept(of_block.block_of, given)
         blocks: list[Any] = self.sent["blocks"]
         return blocks
@@ -111,7 +112,7 @@ class HelmertSolver:
     def _weights(self, weight: FloatArray) -> list[Any]:
         """Return where the weights of the blocks are kept, which are sent when they change."""
         if "weight" not in self.sent or not np.array_equal(self.sent["weight"], weight):
-            of_blocks = [(weight[piece.rays],) for piece in self.pieces]
+            of_blocks = ((weight[piece.rays],) for piece in self.pieces)
             self.sent["weights"], self.sent["weight"] = self.kept(_same, of_blocks), weight.copy()
         weights: list[Any] = self.sent["weights"]
         return weights
@@ -125,14 +126,12 @@ class HelmertSolver:
             damping: share of its diagonal added to the normal matrix.
         """
         given = self._given(state) if self.observed else None
-        arguments = [
-            (kept, piece.state(state), weights, damping, self._own_terms(b, given))
-            for b, (piece, kept, weights) in enumerate(
-                zip(self.pieces, self._blocks(), self._weights(weight), strict=True)
-            )
-        ]
+        kept = zip(self.pieces, self._blocks(), self._weights(weight), strict=True)
+        arguments = (
+            (block, piece.state(state), weights, damping, self._own_terms(b, given))
+            for b, (piece, block, weights) in enumerate(kept)
+        )
         formed = self.kept(of_block.form, arguments)
-        del arguments
         summaries = self.each(of_block.summary_of, [(equations,) for equations in formed])
         g, diagonal = np.zeros(self.layout.reduced), np.zeros(self.layout.reduced)
         held = np.zeros(len(self.layout.point_free), dtype=np.int64)
@@ -223,7 +222,7 @@ class HelmertSolver:
             return None
         piece = self.pieces[b]
         mine: BoolArray = np.asarray(given.V[piece.points].any(axis=(1, 2)))
-        mine[piece.layout.kept] &= b == 0
+        mine[piece.kept] &= b == 0
         points = np.flatnonzero(mine)
         there, poses = piece.points[points], piece.poses[: piece.inner]
         return of_block.OwnTerms(

@@ -27,13 +27,12 @@ from sfm.model.conventions import FloatArray, IntArray
 
 @dataclass(frozen=True)
 class Piece:
-    """A block of photographs: its own layout of unknowns, and where they are in the network.
+    """A block of photographs: where its unknowns and image points are in the network.
 
     Its poses are the inner ones, then those of the interface that its image points or its share of the kept
     points need. Its other reduced unknowns are those of the network.
     """
 
-    layout: Unknowns
     inner: int  # number of inner poses, which come first
     poses: IntArray  # pose in the network of each of its poses, (poses,)
     images: IntArray  # photograph in the network of each of its photographs, (m,)
@@ -41,6 +40,7 @@ class Piece:
     rays: IntArray  # image point in the layout of the network of each of its image points, (k,)
     columns: IntArray  # reduced unknown of the network of each of its reduced unknowns, (reduced,)
     at: IntArray  # place among the unknowns of the interface of those after the inner ones, (6 r + b,)
+    kept: IntArray  # places of the kept points among its object points, (s,)
 
     @property
     def own(self) -> IntArray:
@@ -55,7 +55,7 @@ class Piece:
         """
         position, M = state.position[self.images], state.M[self.images]
         of_poses = position, M
-        if self.layout.rigged:
+        if state.pose_position is not state.position:
             of_poses = state.pose_position[self.poses], state.rig_from_object[self.poses]
         points = state.points[self.points]
         mounts = state.mount_position, state.camera_from_rig
@@ -158,17 +158,29 @@ def _piece(
 ) -> Piece:
     """Return the block of some poses, object points and image points of a network."""
     o, first = layout.observations, layout.pose_free.size
-    pose_at, image_at = np.full(o.poses, -1), np.full(len(o.pose_of), -1)
+    pose_at = np.full(o.poses, -1)
     pose_at[poses] = np.arange(len(poses))
     images = np.flatnonzero(pose_at[o.pose_of] >= 0)
     images = images[np.argsort(pose_at[o.pose_of[images]], kind="stable")]
-    image_at[images] = np.arange(len(images))
-    point_at = np.full(len(layout.point_free), -1)
-    point_at[points] = np.arange(len(points))
-    point = point_at[o.point[rays]]
-    start = np.zeros(len(points) + 1, dtype=np.int64)
-    np.cumsum(np.bincount(point, minlength=len(points)), out=start[1:])
-    shift = 6 * len(poses) - first
+    columns = np.concatenate([_six(poses), np.arange(first, layout.reduced)])
+    kept = np.searchsorted(points, layout.kept)
+    return Piece(inner, poses, images, points, rays, columns, place[columns[6 * inner :]], kept)
+
+
+def layout_of(layout: Unknowns, piece: Piece) -> Unknowns:
+    """Return the layout of the unknowns of a block, with its image points.
+
+    Args:
+        layout: order of the unknowns of the network.
+        piece: the block.
+    """
+    o, rays, images = layout.observations, piece.rays, piece.images
+    pose_at, image_at = np.full(o.poses, -1), np.full(len(o.pose_of), -1)
+    pose_at[piece.poses], image_at[images] = np.arange(len(piece.poses)), np.arange(len(images))
+    point = np.searchsorted(piece.points, o.point[rays])
+    start = np.zeros(len(piece.points) + 1, dtype=np.int64)
+    np.cumsum(np.bincount(point, minlength=len(piece.points)), out=start[1:])
+    shift = 6 * len(piece.poses) - layout.pose_free.size
     observations = o._replace(
         start=start,
         image=image_at[o.image[rays]],
@@ -179,27 +191,25 @@ def _piece(
         camera=o.camera[images],
         pose=pose_at[o.pose[rays]],
         pose_of=pose_at[o.pose_of[images]],
-        poses=len(poses),
+        poses=len(piece.poses),
         free_column=np.maximum(o.free_column + shift, 0),
     )
-    own = replace(
+    return replace(
         layout,
         observations=observations,
-        order=np.arange(len(rays)),
-        active=layout.active[rays],
-        pose_free=layout.pose_free[poses],
+        order=np.zeros(0, dtype=np.int64),  # needed by the network only
+        active=np.zeros(0, dtype=bool),
+        pose_free=layout.pose_free[piece.poses],
         interior_column=tuple(column + shift for column in layout.interior_column),
         mount_column=np.where(layout.mount_column >= 0, layout.mount_column + shift, -1),
-        point_free=layout.point_free[points],
+        point_free=layout.point_free[piece.points],
         image_on=layout.image_on[images],
-        point_on=layout.point_on[points],
-        kept=point_at[layout.kept],
+        point_on=layout.point_on[piece.points],
+        kept=piece.kept,
         reduced=layout.reduced + shift,
         held=(),
         held_defect=0,
     )
-    columns = np.concatenate([_six(poses), np.arange(first, layout.reduced)])
-    return Piece(own, inner, poses, images, points, rays, columns, place[columns[6 * inner :]])
 
 
 def added_at(total: FloatArray, rows: IntArray, part: FloatArray) -> None:
