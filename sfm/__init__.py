@@ -5,6 +5,7 @@
     True
 
 `run_survey` runs a whole survey. Image points measured elsewhere go through `Network`, `orient` and `adjust`.
+Large networks are adjusted on a cluster within `helmert_blocks`.
 The methods underneath are in packages, each with a list of its public names and an example:
 
 - `targets`, `matching`: measurement in photographs.

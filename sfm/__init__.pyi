@@ -5,6 +5,7 @@ from sfm.adjustment.datum import Datum as Datum
 from sfm.adjustment.result import Adjustment as Adjustment
 from sfm.adjustment.solve import AdjustmentOptions as AdjustmentOptions
 from sfm.judgement.survey_result import SurveyResult as SurveyResult
+from sfm.library.blocks import helmert_blocks as helmert_blocks
 from sfm.library.results import adjust as adjust
 from sfm.library.results import compare as compare
 from sfm.library.results import distance as distance

@@ -53,6 +53,15 @@ PicturesMb = Annotated[
         help="Largest total size of photographs and crops inside report.html; the others are in pictures/.",
     ),
 ]
+Cluster = Annotated[
+    str | None,
+    typer.Option(
+        "--cluster",
+        metavar="ADDRESS",
+        help="Dask scheduler, such as tcp://192.168.1.5:8786, whose workers adjust a large network in "
+        "Helmert blocks. They need Kolinear.",
+    ),
+]
 Verbose = Annotated[
     bool, typer.Option("--verbose", "-v", help="Also print every photograph and every warning.")
 ]

@@ -6,7 +6,7 @@ import os
 import sys
 import time
 from collections.abc import Callable, Iterator
-from contextlib import contextmanager, suppress
+from contextlib import contextmanager, nullcontext, suppress
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, NamedTuple, Protocol
@@ -54,6 +54,7 @@ class RunOptions:
     images: Path | None = None  # folder of the photographs; None: the one that the survey file states
     out: Path | None = None  # folder of the result; None: out/NAME
     jobs: int | None = None  # photographs at a time; None: one per core
+    cluster: str | None = None  # Dask scheduler whose workers adjust in blocks; None: this process adjusts
     allow_outside: bool = False  # whether the survey file may name files outside its folder
     verbose: bool = False  # whether more is printed
     from_photographs: bool | None = None  # False for surveys with [observations]; None: the file decides
@@ -72,6 +73,7 @@ def run_survey_file(survey_file: Path, options: RunOptions) -> Path:
         from sfm.cli.console import print_result
         from sfm.files.globs import nearest_name
         from sfm.files.open_folders import refuse_foreign_folder
+        from sfm.library.blocks import helmert_blocks
         from sfm.library.results import read_result
         from sfm.library.surveys import colmap_writer, programs_of
         from sfm.pipeline import run_survey
@@ -148,6 +150,7 @@ def run_survey_file(survey_file: Path, options: RunOptions) -> Path:
         one_blas_thread(),
         plot_process(jobs) as plots,
         lock_folder(folder),
+        nullcontext() if options.cluster is None else helmert_blocks(cluster=options.cluster),
         SurveyLog(watch=drawn) as log,
     ):
         history, work = RunHistory.of_user(), work_of(survey, files)

@@ -2,7 +2,17 @@
 
 from __future__ import annotations
 
-from sfm.cli.options import AllowOutside, Calibration, Out, Overwrite, Pdf, SurveyFile, Verbose, Weighted
+from sfm.cli.options import (
+    AllowOutside,
+    Calibration,
+    Cluster,
+    Out,
+    Overwrite,
+    Pdf,
+    SurveyFile,
+    Verbose,
+    Weighted,
+)
 from sfm.cli.survey_runs import RunOptions, run_survey_file
 
 
@@ -12,6 +22,7 @@ def adjust(
     camera_weighted: Weighted = False,
     out: Out = None,
     overwrite: Overwrite = False,
+    cluster: Cluster = None,
     allow_outside: AllowOutside = False,
     verbose: Verbose = False,
     pdf: Pdf = False,
@@ -32,5 +43,6 @@ def adjust(
         camera=camera,
         weighted=camera_weighted,
         overwrite=overwrite,
+        cluster=cluster,
     )
     run_survey_file(survey_file, options)

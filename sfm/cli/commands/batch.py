@@ -19,6 +19,7 @@ from threadpoolctl import threadpool_limits
 from sfm.cli.options import AllowOutside, Pdf, PicturesMb, Verbose
 from sfm.cli.process import FAILED, compile_first, loading
 from sfm.cli.survey_runs import drafted_beside
+from sfm.library.blocks import INSTALL_DASK
 from sfm.model.errors import (
     GeometryError,
     KolinearError,
@@ -33,8 +34,6 @@ from sfm.runtime.faults import FAULT
 if TYPE_CHECKING:
     from sfm.survey.assembly import OtherPrograms
     from sfm.survey.inputs.survey import Survey
-
-INSTALL_DASK = "pip install 'dask[distributed]' cryptography, the extra kolinear[cluster]"
 
 
 def batch(

@@ -10,6 +10,7 @@ import typer
 from sfm.cli.options import (
     AllowOutside,
     Calibration,
+    Cluster,
     Frames,
     Jobs,
     Out,
@@ -59,6 +60,7 @@ def run(
     out: Out = None,
     overwrite: Overwrite = False,
     jobs: Jobs = None,
+    cluster: Cluster = None,
     pictures_mb: PicturesMb = 15.0,
     allow_outside: AllowOutside = False,
     verbose: Verbose = False,
@@ -95,6 +97,7 @@ def run(
             images=photographs or images,
             out=folder,
             jobs=jobs,
+            cluster=cluster,
             allow_outside=allow_outside,
             verbose=verbose,
             from_photographs=True,

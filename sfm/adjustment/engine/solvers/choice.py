@@ -35,6 +35,9 @@ FACTOR_RATE = 25e9  # Cholesky factor of a full matrix, which uses one thread wh
 FRONT_RATE = 20e9  # Cholesky factors of many smaller matrices, which are added to one another
 PAIR_RATE = 25e9  # product of two rays of a point, compiled
 PAIR_OPERATIONS = 216  # operations of a 6 x 6 x 3 product
+# An iteration in one process takes 0.6 to 1 microsecond per image point (646,000 to 7 million), and its
+# messages to two workers on one computer 0.25 to 0.5 s.
+IMAGE_POINT_SECONDS, MESSAGES_SECONDS = 0.8e-6, 0.25
 SMALL = 64  # number of photographs up to which the product of full rows is always cheap enough
 SAMPLED = 2  # pairs of rays for each pair of photographs in the sample that shows whether most share points
 TRIED_PAIRS = 1000  # sampled pairs of photographs; a share of 0.5 then has the standard deviation 0.016
@@ -89,7 +92,11 @@ def blocks_of(layout: Unknowns, observed: tuple[ObservedKind, ...]) -> HelmertSo
     blocking = current_blocking()
     if blocking is None:
         return None
-    count = blocking.keeper.workers if blocking.blocks is None else blocking.blocks
+    count = blocking.blocks
+    if count is None:
+        count, k = blocking.keeper.workers, len(layout.order)
+        if k * IMAGE_POINT_SECONDS * (1 - 1 / count) < MESSAGES_SECONDS:
+            return None
     partition = partition_of(layout, count, coupled_poses(observed, layout))
     return None if partition is None else HelmertSolver(layout, observed, partition, blocking.keeper)
 

@@ -1,0 +1,149 @@
+"""Helmert blocks in the workers of a Dask cluster: the same to the last bit, whatever dies meanwhile."""
+
+from __future__ import annotations
+
+import json
+import os
+import signal
+import subprocess
+import sys
+import time
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+import sfm
+from adapters.dask_cluster import DaskEngine, local_engine, remote_engine
+from sfm.adjustment.engine.solvers.helmert import HelmertSolver
+from sfm.adjustment.result import Adjustment
+from sfm.model.errors import BackendError, KolinearError
+from sfm.runtime.executor import Blocking, Call, Keeper, KeptHere, in_blocks
+from tests.places import ROOT
+from tests.synthetic_blocks import aerial, run, spoiled
+
+THIRD = 3  # factor at which something dies: amid the iteration
+
+
+@pytest.fixture(scope="module")
+def two_workers() -> Iterator[DaskEngine]:
+    with local_engine(2) as engine:
+        yield engine
+
+
+def adjusted(keeper: Keeper, blocks: int) -> Adjustment:
+    network, truth = aerial("on dask", 6, 14, 1200)
+    with in_blocks(Blocking(keeper, blocks)):
+        return run(network, spoiled(truth, "on dask", 0.25))
+
+
+def bits(a: Adjustment) -> tuple[bytes, ...]:
+    return a.estimate.points.tobytes(), a.covariance.points.tobytes(), a.covariance.exterior.tobytes()
+
+
+def at_third_factor(patch: pytest.MonkeyPatch, happens: Callable[[], None]) -> None:
+    """Let something happen when the normal equations are formed and not yet reduced."""
+    factor, count = HelmertSolver._factor_with, 0
+
+    def factor_with(solver: HelmertSolver, *arguments: Any) -> object:
+        nonlocal count
+        count += 1
+        if count == THIRD:
+            happens()
+        return factor(solver, *arguments)
+
+    patch.setattr(HelmertSolver, "_factor_with", factor_with)
+
+
+def test_two_workers_give_the_bits_of_this_process(
+    two_workers: DaskEngine, monkeypatch: pytest.MonkeyPatch, capfd: pytest.CaptureFixture[str]
+) -> None:
+    """Also if one of them is killed amid the iteration, which a line says."""
+    here = bits(adjusted(KeptHere(), 2))
+    assert bits(adjusted(two_workers, 2)) == here
+    assert capfd.readouterr().err == ""
+    pids: dict[str, int] = two_workers.client.run(os.getpid)
+    victim = min(pids)
+    at_third_factor(monkeypatch, lambda: os.kill(pids[victim], signal.SIGKILL))
+    assert bits(adjusted(two_workers, 2)) == here
+    said = capfd.readouterr().err.splitlines()
+    assert said == [f"worker {victim} was lost; the others compute its blocks again"]
+
+
+def test_an_error_in_a_block_is_raised_here(two_workers: DaskEngine) -> None:
+    with pytest.raises(ZeroDivisionError):
+        two_workers.fetch([Call(divmod, (1, 0))])
+    (kept,) = two_workers.keep([Call(divmod, (7, 2))])
+    assert two_workers.fetch([Call(sum, (kept,))]) == [4]
+
+
+def test_blocks_that_cannot_be_are_refused() -> None:
+    with pytest.raises(KolinearError, match="blocks 0, expected at least 1"):
+        sfm.helmert_blocks(0)
+    with pytest.raises(KolinearError, match="workers are processes on this computer"):
+        sfm.helmert_blocks(workers=2, cluster="tcp://127.0.0.1:1")
+    with (
+        pytest.raises(BackendError, match="no Dask scheduler answers"),
+        sfm.helmert_blocks(cluster="tcp://127.0.0.1:1"),
+    ):
+        raise AssertionError("entered without a scheduler")
+
+
+@pytest.mark.slow
+def test_four_workers_give_the_bits_of_this_process() -> None:
+    here = bits(adjusted(KeptHere(), 4))
+    with local_engine(4) as engine:
+        assert bits(adjusted(engine, 4)) == here
+
+
+@contextmanager
+def scheduler_and_workers(folder: Path) -> Iterator[tuple[str, subprocess.Popen[bytes]]]:
+    """A scheduler and two workers in processes of their own; yield its address and process."""
+    file = folder / "scheduler.json"
+    file.unlink(missing_ok=True)
+
+    def start(module: str, *options: str) -> subprocess.Popen[bytes]:
+        command = [sys.executable, "-m", f"distributed.cli.{module}", *options]
+        return subprocess.Popen(command, cwd=ROOT, stderr=subprocess.DEVNULL)
+
+    no_pages = "--no-dashboard"
+    running = [
+        start("dask_scheduler", "--host", "127.0.0.1", "--port", "0", no_pages, "--scheduler-file", str(file))
+    ]
+    try:
+        while not file.exists():
+            time.sleep(0.1)
+        address = json.loads(file.read_text(encoding="utf-8"))["address"]
+        local = "--local-directory", str(folder)
+        running.append(start("dask_worker", address, "--nworkers", "2", "--nthreads", "1", no_pages, *local))
+        yield address, running[0]
+    finally:
+        for process in reversed(running):
+            process.kill() if process is running[0] else process.terminate()
+            process.wait(timeout=20)
+
+
+@pytest.mark.slow
+def test_a_scheduler_that_is_killed_is_one_line_and_starting_again_gives_the_same(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    here = bits(adjusted(KeptHere(), 2))
+    with scheduler_and_workers(tmp_path) as (address, scheduler), remote_engine(address) as engine:
+        engine.client.wait_for_workers(2, timeout=60)
+        at_third_factor(monkeypatch, scheduler.kill)
+        with pytest.raises(BackendError) as error:
+            adjusted(engine, 2)
+    assert "\n" not in str(error.value)
+    assert "the Dask scheduler is gone" in str(error.value)
+    assert "run again, the result will be the same" in str(error.value)
+    with scheduler_and_workers(tmp_path) as (address, _), remote_engine(address) as engine:
+        engine.client.wait_for_workers(2, timeout=60)
+        assert bits(adjusted(engine, 2)) == here
+
+
+@pytest.mark.slow
+def test_a_worker_that_dies_of_a_block_again_and_again_is_one_line(two_workers: DaskEngine) -> None:
+    with pytest.raises(BackendError, match="worker processes died, out of memory or by a fault"):
+        two_workers.fetch([Call(signal.raise_signal, (signal.SIGKILL,))])
