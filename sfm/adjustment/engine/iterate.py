@@ -332,6 +332,7 @@ def _approach(
         else:
             damping *= growth
             growth *= 2
+        move = None  # its memory is needed for the next step
         if damping > MAX_DAMPING:
             break
     return state, max_iterations, start_vPv

@@ -38,7 +38,7 @@ from sfm.adjustment.engine.solvers.multifrontal_factor import (
     inverse_of,
     substitute_back,
 )
-from sfm.adjustment.engine.solvers.partition import graph_of
+from sfm.adjustment.engine.solvers.partition import graph_of, repeated, unpacked
 from sfm.adjustment.engine.solvers.protocol import Inverse
 from sfm.adjustment.engine.unknowns import Unknowns
 from sfm.model.conventions import FloatArray, IntArray
@@ -104,9 +104,10 @@ def block_of(layout: Unknowns, inner: int) -> Block:
     """Return a block with its fronts.
 
     Args:
-        layout: order of its unknowns.
+        layout: order of its unknowns, as it was sent.
         inner: number of its inner poses, which come first.
     """
+    layout = unpacked(layout)
     observations = layout.observations
     graph = graph_of(observations, NO_POINTS)
     return Block(layout, inner, fronts_of(observations, graph, observations.poses - inner))
@@ -118,7 +119,7 @@ def form(block: Block, state: State, weight: FloatArray, damping: float, given: 
     Args:
         block: the block.
         state: values of its parameters.
-        weight: factor on the weight of each of its image points, (k,).
+        weight: factor on the weight of each of its image points, (k,), or one for all, (1,).
         damping: share of its diagonal added to the normal matrix.
         given: terms of other observations.
     """
@@ -131,6 +132,7 @@ def form(block: Block, state: State, weight: FloatArray, damping: float, given: 
         given = OwnTerms(NO_POINTS, np.zeros((0, 3, 3)), np.zeros((0, 3)), *none)
     b.V[given.points] += given.V
     b.gp[given.points] += given.gp
+    weight = repeated(weight, len(layout.observations.point))
     return reduced_to_orientations(layout, given, state, weight, damping, space)
 
 
@@ -236,7 +238,8 @@ def inverse_in(
 
 def squares(block: Block, state: State, weight: FloatArray) -> float:
     """Return v'Pv of the image points of a block; infinite if a point is behind a camera."""
-    return sum_of_squares(block.layout.observations, state, weight)
+    observations = block.layout.observations
+    return sum_of_squares(observations, state, repeated(weight, len(observations.point)))
 
 
 def point_step(equations: Equations, x: FloatArray) -> FloatArray:

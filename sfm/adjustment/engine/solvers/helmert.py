@@ -39,7 +39,7 @@ from sfm.adjustment.engine.solvers import protocol
 from sfm.adjustment.engine.solvers.dense import WEAK_PIVOT
 from sfm.adjustment.engine.solvers.fronts import BYTES
 from sfm.adjustment.engine.solvers.multifrontal import factor_with_null_space
-from sfm.adjustment.engine.solvers.partition import Partition, Piece, added_at, layout_of
+from sfm.adjustment.engine.solvers.partition import Partition, Piece, added_at, layout_of, packed
 from sfm.adjustment.engine.solvers.protocol import Inverse
 from sfm.adjustment.engine.unknowns import Unknowns
 from sfm.model.conventions import BoolArray, FloatArray, IntArray
@@ -112,7 +112,7 @@ class HelmertSolver:
     def _weights(self, weight: FloatArray) -> list[Any]:
         """Return where the weights of the blocks are kept, which are sent when they change."""
         if "weight" not in self.sent or not np.array_equal(self.sent["weight"], weight):
-            of_blocks = ((weight[piece.rays],) for piece in self.pieces)
+            of_blocks = ((packed(weight[piece.rays]),) for piece in self.pieces)
             self.sent["weights"], self.sent["weight"] = self.kept(_same, of_blocks), weight.copy()
         weights: list[Any] = self.sent["weights"]
         return weights

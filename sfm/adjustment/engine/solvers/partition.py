@@ -22,7 +22,7 @@ from scipy.sparse import csr_matrix
 from sfm.adjustment.engine.collinearity import Observations, State
 from sfm.adjustment.engine.solvers.fronts import split
 from sfm.adjustment.engine.unknowns import Unknowns
-from sfm.model.conventions import FloatArray, IntArray
+from sfm.model.conventions import AnyArray, FloatArray, IntArray
 
 
 @dataclass(frozen=True)
@@ -168,7 +168,10 @@ def _piece(
 
 
 def layout_of(layout: Unknowns, piece: Piece) -> Unknowns:
-    """Return the layout of the unknowns of a block, with its image points.
+    """Return the layout of the unknowns of a block, with its image points as they are sent.
+
+    What the process of the block can derive is left out, so that an image point takes 20 to 52 bytes;
+    `unpacked` restores it.
 
     Args:
         layout: order of the unknowns of the network.
@@ -177,19 +180,20 @@ def layout_of(layout: Unknowns, piece: Piece) -> Unknowns:
     o, rays, images = layout.observations, piece.rays, piece.images
     pose_at, image_at = np.full(o.poses, -1), np.full(len(o.pose_of), -1)
     pose_at[piece.poses], image_at[images] = np.arange(len(piece.poses)), np.arange(len(images))
+    image: AnyArray = image_at.astype(np.int32)[o.image[rays]]
     point = np.searchsorted(piece.points, o.point[rays])
     start = np.zeros(len(piece.points) + 1, dtype=np.int64)
     np.cumsum(np.bincount(point, minlength=len(piece.points)), out=start[1:])
     shift = 6 * len(piece.poses) - layout.pose_free.size
     observations = o._replace(
         start=start,
-        image=image_at[o.image[rays]],
-        point=point,
+        image=image,
+        point=np.zeros(0, dtype=np.int64),
         xy=o.xy[rays],
-        whitening=o.whitening[rays],
-        share=o.share[rays],
+        whitening=packed(o.whitening[rays]),
+        share=packed(o.share[rays]),
         camera=o.camera[images],
-        pose=pose_at[o.pose[rays]],
+        pose=np.zeros(0, dtype=np.int64),
         pose_of=pose_at[o.pose_of[images]],
         poses=len(piece.poses),
         free_column=np.maximum(o.free_column + shift, 0),
@@ -210,6 +214,39 @@ def layout_of(layout: Unknowns, piece: Piece) -> Unknowns:
         held=(),
         held_defect=0,
     )
+
+
+def unpacked(layout: Unknowns) -> Unknowns:
+    """Return the layout of a block with all that was left out for sending.
+
+    Args:
+        layout: what `layout_of` returned.
+    """
+    o, k = layout.observations, len(layout.observations.xy)
+    image = o.image.astype(np.int64)
+    observations = o._replace(
+        image=image,
+        point=np.repeat(np.arange(len(o.start) - 1), np.diff(o.start)),
+        pose=o.pose_of[image],
+        whitening=repeated(o.whitening, k),
+        share=repeated(o.share, k),
+    )
+    return replace(layout, observations=observations)
+
+
+def packed(rows: FloatArray) -> FloatArray:
+    """Return rows to send: one row if all are equal."""
+    return rows[:1] if len(rows) and (rows == rows[:1]).all() else rows
+
+
+def repeated(rows: FloatArray, count: int) -> FloatArray:
+    """Return all rows of what `packed` returned.
+
+    Args:
+        rows: one row or all.
+        count: number of rows.
+    """
+    return rows if len(rows) == count else np.repeat(rows, count, axis=0)
 
 
 def added_at(total: FloatArray, rows: IntArray, part: FloatArray) -> None:
