@@ -51,10 +51,8 @@ NOBODY_SECONDS = 60.0  # without any worker before a run gives up; starting a ne
 LOOK_SECONDS = 2.0
 CLOSE_SECONDS = 5.0
 EVERYTHING = "all"  # topic of what happens to workers
-GONE, BATCH_AGAIN = "the Dask scheduler is gone", "run again with --resume"
-ADJUSTMENT_AGAIN = "run again, the result will be the same"
+BATCH_AGAIN, ADJUSTMENT_AGAIN = "run again with --resume", "run again, the result will be the same"
 DIED = "worker processes died, out of memory or by a fault in a library"
-LACKING = "the workers of the cluster lack what Kolinear needs"
 # Numerical libraries read these thread limits when a process starts.
 ONE_THREAD = dict.fromkeys(
     (
@@ -333,7 +331,7 @@ class DaskEngine:
         try:
             workers = sorted(self.client.nthreads())
         except OSError as error:
-            raise BackendError(f"{GONE}; {ADJUSTMENT_AGAIN}") from error
+            raise BackendError(f"the Dask scheduler is gone; {ADJUSTMENT_AGAIN}") from error
         futures = []
         with dask.config.set({"distributed.admin.large-graph-warning-threshold": f"{sys.maxsize}B"}):
             for place, call in enumerate(calls):
@@ -372,13 +370,17 @@ class DaskEngine:
                     self.say(f"worker {worker} was lost; the others compute its blocks again")
             return list(self.client.gather(futures))
         except CancelledError as error:
-            raise BackendError(f"{GONE} or has dropped the work; {ADJUSTMENT_AGAIN}") from error
+            raise BackendError(
+                f"the Dask scheduler is gone or has dropped the work; {ADJUSTMENT_AGAIN}"
+            ) from error
         except KilledWorker as error:
             raise BackendError(
                 f"{DIED} with a block of the network; use workers with more memory, or more of them"
             ) from error
         except ImportError as error:
-            raise BackendError(f"{LACKING}: {_line(error)}") from error
+            raise BackendError(
+                f"the workers of the cluster lack what Kolinear needs: {_line(error)}"
+            ) from error
 
     def _lost_workers(self) -> Iterator[str]:
         """Yield the workers that were lost since the last look."""
@@ -390,11 +392,11 @@ class DaskEngine:
         """Return when a worker was last seen; raise BackendError if that is too long ago."""
         try:
             if self.client.status not in ("running", "connecting"):
-                raise BackendError(f"{GONE}; {again}")
+                raise BackendError(f"the Dask scheduler is gone; {again}")
             if self.client.nthreads():
                 return time.monotonic()
         except OSError as error:
-            raise BackendError(f"{GONE}; {again}") from error
+            raise BackendError(f"the Dask scheduler is gone; {again}") from error
         if time.monotonic() - someone > NOBODY_SECONDS:
             raise BackendError(f"the Dask scheduler has had no worker for {NOBODY_SECONDS:.0f} s")
         return someone
@@ -461,13 +463,13 @@ def _event(key: str, future: Future[Any]) -> Event:
     try:
         return Done(key, future.result())
     except CancelledError as error:
-        raise BackendError(f"{GONE} or has dropped the work; {BATCH_AGAIN}") from error
+        raise BackendError(f"the Dask scheduler is gone or has dropped the work; {BATCH_AGAIN}") from error
     except KilledWorker:
         return Lost(key, DIED)
     except KolinearError:
         raise
     except ImportError as error:
-        raise BackendError(f"{LACKING}: {_line(error)}") from error
+        raise BackendError(f"the workers of the cluster lack what Kolinear needs: {_line(error)}") from error
     except Exception as error:
         return Lost(key, f"it failed in its worker: {type(error).__name__}: {_line(error)}")
 

@@ -426,8 +426,12 @@ def test_a_survey_that_kills_workers_is_set_aside(
     killer = write_observed_survey(tmp_path / "killer", KILLER)
     out = tmp_path / "out"
     after = write_observed_survey(tmp_path / "after", "after")
-    rows = run_batch([surveys[2], killer, after], out, nullcontext(two_workers), ALONE, Notes())
+    notes = Notes()
+    rows = run_batch([surveys[2], killer, after], out, nullcontext(two_workers), ALONE, notes)
     assert [row.status for row in rows] == ["done", "set aside", "done"]
+    assert len(notes.remarks) >= 2 and all(
+        "was lost; the others do its work again" in line for line in notes.remarks
+    )
     assert "worker processes died" in rows[1].reason and rows[1].fault
     points = points_of(out)
     assert points.keys() == {"third", "after"} and points["third"] == points_of(finished)["third"]
