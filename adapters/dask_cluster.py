@@ -13,10 +13,10 @@ import signal
 import sys
 import time
 import uuid
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from concurrent.futures import CancelledError
 from contextlib import AbstractContextManager, ExitStack, contextmanager, suppress
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, fields, is_dataclass
 from itertools import count
 from multiprocessing import resource_tracker
 from threading import Lock
@@ -25,6 +25,7 @@ from typing import Any
 import dask
 import dask.system
 import distributed.system
+import numpy as np
 from dask.distributed import (
     Client,
     Future,
@@ -332,6 +333,12 @@ class DaskEngine:
             workers = sorted(self.client.nthreads())
         except OSError as error:
             raise BackendError(f"the Dask scheduler is gone; {ADJUSTMENT_AGAIN}") from error
+        return self._start(_kept, calls, workers)
+
+    def _start(
+        self, way: Callable[..., Any], calls: Iterable[Call], workers: Sequence[str]
+    ) -> list[Future[Any]]:
+        """Submit calls that are made in some way."""
         futures = []
         with dask.config.set({"distributed.admin.large-graph-warning-threshold": f"{sys.maxsize}B"}):
             for place, call in enumerate(calls):
@@ -339,7 +346,7 @@ class DaskEngine:
                 where = [workers[place % len(workers)]] if begins and workers else None
                 futures.append(
                     self.client.submit(
-                        _in_one_thread,
+                        way,
                         call.function,
                         *call.arguments,
                         key=f"block-{uuid.uuid4().hex}",
@@ -358,7 +365,7 @@ class DaskEngine:
             KolinearError: an error raised by a called function.
         """
         try:
-            futures = self.keep(calls)
+            futures = self._start(_in_one_thread, calls, ())
             someone, waiting = time.monotonic(), True
             while waiting:
                 try:
@@ -421,7 +428,39 @@ def _call(call: Call, parts: list[Any] | None = None, *, topic: str, work: str) 
 def _in_one_thread(function: Callable[..., Any], *arguments: Any) -> Any:
     """Run a call of a keeper in a worker, with its libraries limited to one thread each."""
     with _HELD:
-        return function(*arguments)
+        return function(
+            *(argument.value if isinstance(argument, _Kept) else argument for argument in arguments)
+        )
+
+
+def _kept(function: Callable[..., Any], *arguments: Any) -> _Kept:
+    """Run a call of a keeper in a worker, whose result stays there."""
+    return _Kept(_in_one_thread(function, *arguments))
+
+
+@dataclass(frozen=True)
+class _Kept:
+    """A result that stays in its worker, with its size: Dask takes that of a dataclass for some bytes.
+
+    It would let another worker copy the result to compute on it, and never move it to the disk.
+    """
+
+    value: Any
+
+    def __sizeof__(self) -> int:
+        """Return the bytes of all arrays in the value."""
+        return _bytes_of(self.value)
+
+
+def _bytes_of(value: Any) -> int:
+    """Return the bytes of the arrays in a value and in its fields and elements."""
+    if isinstance(value, np.ndarray):
+        return int(value.nbytes)
+    if is_dataclass(value):
+        return sum(_bytes_of(getattr(value, one.name)) for one in fields(value))
+    if isinstance(value, tuple | list):
+        return sum(map(_bytes_of, value))
+    return sys.getsizeof(value)
 
 
 class _OneThread:

@@ -90,6 +90,9 @@ def test_a_scheduler_cannot_be_used(tmp_path: Path, capsys: pytest.CaptureFixtur
     code, told = run(capsys, "batch", survey, "--out", out, "--cluster", "tcp://10.0.0.1:8")
     assert code == 2 and f"--cluster tcp://10.0.0.1:8: Dask is not installed: {INSTALL_DASK}" in told
     assert not out.exists()
+    code, told = run(capsys, "adjust", survey, "--out", out, "--cluster", "tcp://10.0.0.1:8")
+    assert code == 2 and f"Helmert blocks: Dask is not installed: {INSTALL_DASK}" in told
+    assert not out.exists()
 
 
 def test_doctor_calls_the_core_sound(capsys: pytest.CaptureFixture[str]) -> None:

@@ -60,6 +60,7 @@ PUBLIC = {
         "distance",
         "find_targets",
         "fit_shape",
+        "helmert_blocks",
         "measure",
         "fit_similarity",
         "network_from_colmap",

@@ -86,9 +86,8 @@ class Summary(NamedTuple):
 
 @dataclass(frozen=True)
 class Reduced:
-    """A block with its inner poses eliminated."""
+    """The inner poses of a block, eliminated."""
 
-    block: Block
     scale: FloatArray  # scale of exterior unknowns, 1 for those of the interface, (6 poses,)
     eliminated: list[EliminatedFront]
     E: FloatArray  # L^-1 C_I, and C_R - K E below, (6 poses, b)
@@ -170,7 +169,7 @@ def reduce(block: Block, equations: Equations, added: FloatArray) -> Reduced | N
     joint[outer:, :outer] = E[own:].T
     joint[outer:, outer:] = D - E[:own].T @ E[:own]
     packed, _ = dtrttp(joint.T, uplo="U")  # the upper triangle of the transpose
-    return Reduced(block, scale, eliminated, E, packed)
+    return Reduced(scale, eliminated, E, packed)
 
 
 def joint_of(reduced: Reduced | None) -> tuple[FloatArray, float] | None:
@@ -178,56 +177,65 @@ def joint_of(reduced: Reduced | None) -> tuple[FloatArray, float] | None:
     return None if reduced is None else (reduced.joint, reduced.weakest)
 
 
-def forward(reduced: Reduced, right: FloatArray) -> FloatArray:
+def forward(block: Block, reduced: Reduced, right: FloatArray) -> FloatArray:
     """Return right-hand sides with the inner poses eliminated: h = L^-1 g_I, and -K h below, (6 poses, r).
 
     Args:
-        reduced: the block.
+        block: the block.
+        reduced: its inner poses, eliminated.
         right: right-hand sides of its inner poses, (6 inner, r).
     """
-    own = 6 * reduced.block.inner
+    own = 6 * block.inner
     x = np.zeros((len(reduced.scale), right.shape[1]))
     x[:own] = reduced.scale[:own, None] * right
-    eliminate_right(reduced.block.fronts, reduced.eliminated, x)
+    eliminate_right(block.fronts, reduced.eliminated, x)
     return x
 
 
-def at_interface(reduced: Reduced, h: FloatArray) -> FloatArray:
+def at_interface(block: Block, reduced: Reduced, h: FloatArray) -> FloatArray:
     """Return the part of eliminated right-hand sides at the interface, -K h and -E'h, (6 r + b, r)."""
-    own = 6 * reduced.block.inner
+    own = 6 * block.inner
     return np.concatenate([h[own:], -reduced.E[:own].T @ h[:own]])
 
 
-def backward(reduced: Reduced, h: FloatArray, interface: FloatArray) -> FloatArray:
+def backward(block: Block, reduced: Reduced, h: FloatArray, interface: FloatArray) -> FloatArray:
     """Return the solution of the inner poses, (6 inner, r).
 
     Args:
-        reduced: the block.
+        block: the block.
+        reduced: its inner poses, eliminated.
         h: eliminated right-hand sides.
         interface: solution of its unknowns of the interface, (6 r + b, r).
     """
-    own, outer = 6 * reduced.block.inner, len(reduced.scale) - 6 * reduced.block.inner
+    own, outer = 6 * block.inner, len(reduced.scale) - 6 * block.inner
     x = h.copy()
     x[:own] -= reduced.E[:own] @ interface[outer:]
     x[own:] = interface[:outer]
-    substitute_back(reduced.block.fronts, reduced.eliminated, x)
+    substitute_back(block.fronts, reduced.eliminated, x)
     return np.asarray(reduced.scale[:own, None] * x[:own])
 
 
 def inverse_in(
-    reduced: Reduced, equations: Equations, Z: FloatArray, X: FloatArray, Q: FloatArray, cross: bool
+    block: Block,
+    reduced: Reduced,
+    equations: Equations,
+    Z: FloatArray,
+    X: FloatArray,
+    Q: FloatArray,
+    cross: bool,
 ) -> Inverse:
     """Return the elements of the inverse that belong to a block.
 
     Args:
-        reduced: the block.
+        block: the block.
+        reduced: its inner poses, eliminated.
         equations: its undamped normal equations.
         Z: A^-1 of its poses of the interface, A of all poses of the network, (6 r, 6 r).
         X: A^-1 C of these poses, (6 r, b).
         Q: elements of the inverse of the border, 0 for fixed unknowns, (b, b).
         cross: whether to compute Y'S^-1.
     """
-    layout, fronts, own = reduced.block.layout, reduced.block.fronts, 6 * reduced.block.inner
+    layout, fronts, own = block.layout, block.fronts, 6 * block.inner
     x = reduced.E.copy()
     x[own:] = X
     substitute_back(fronts, reduced.eliminated, x)

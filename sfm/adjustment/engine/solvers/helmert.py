@@ -100,7 +100,7 @@ class HelmertSolver:
         """Compute a function of each block, and return where its results are kept."""
         return self.keeper.keep(Call(function, given) for given in arguments)
 
-    def _blocks(self) -> list[Any]:
+    def blocks(self) -> list[Any]:
         """Return where the blocks are kept; the image points are sent in the first step only."""
         if "blocks" not in self.sent:
             # one block after the other, since their image points are as large as those of the network
@@ -126,7 +126,7 @@ class HelmertSolver:
             damping: share of its diagonal added to the normal matrix.
         """
         given = self._given(state) if self.observed else None
-        kept = zip(self.pieces, self._blocks(), self._weights(weight), strict=True)
+        kept = zip(self.pieces, self.blocks(), self._weights(weight), strict=True)
         arguments = (
             (block, piece.state(state), weights, damping, self._own_terms(b, given))
             for b, (piece, block, weights) in enumerate(kept)
@@ -154,7 +154,7 @@ class HelmertSolver:
         """Return v'Pv of all observations; infinite if a point is behind a camera."""
         arguments = [
             (kept, piece.state(state), weights)
-            for piece, kept, weights in zip(self.pieces, self._blocks(), self._weights(weight), strict=True)
+            for piece, kept, weights in zip(self.pieces, self.blocks(), self._weights(weight), strict=True)
         ]
         return float(sum(self.each(of_block.squares, arguments))) + vPv_of(self.observed, state)
 
@@ -182,7 +182,7 @@ class HelmertSolver:
         at = self.partition.columns
         own = [
             (kept, formed, added[piece.own])
-            for piece, kept, formed in zip(self.pieces, self._blocks(), equations.formed, strict=True)
+            for piece, kept, formed in zip(self.pieces, self.blocks(), equations.formed, strict=True)
         ]
         reduced = self.kept(of_block.reduce, own)
         joints = self.each(of_block.joint_of, [(one,) for one in reduced])
@@ -379,16 +379,17 @@ class HelmertFactor:
         """Return a solution of S x = right for right-hand sides (reduced,) or (reduced, r)."""
         columns = right if right.ndim == 2 else right[:, None]
         pieces, at, solver = self.solver.pieces, self.solver.partition.columns, self.solver
-        own = [(kept, columns[piece.own]) for kept, piece in zip(self.reduced, pieces, strict=True)]
+        blocks = list(zip(solver.blocks(), self.reduced, strict=True))
+        own = [(*block, columns[piece.own]) for block, piece in zip(blocks, pieces, strict=True)]
         eliminated = solver.kept(of_block.forward, own)
-        pairs = list(zip(self.reduced, eliminated, strict=True))
+        parts = [(*block, h) for block, h in zip(blocks, eliminated, strict=True)]
         there = columns[at].copy()
-        for piece, part in zip(pieces, solver.each(of_block.at_interface, pairs), strict=True):
+        for piece, part in zip(pieces, solver.each(of_block.at_interface, parts), strict=True):
             there[piece.at] += part
         s, x = self.scale[:, None], np.empty_like(columns)
         solved = s * cho_solve((self.cholesky, False), s * there) if len(there) else there
         x[at] = solved
-        arguments = [(*pair, solved[piece.at]) for pair, piece in zip(pairs, pieces, strict=True)]
+        arguments = [(*part, solved[piece.at]) for part, piece in zip(parts, pieces, strict=True)]
         for piece, part in zip(pieces, solver.each(of_block.backward, arguments), strict=True):
             x[piece.own] = part
         return np.asarray(x.reshape(right.shape))
@@ -407,9 +408,10 @@ class HelmertFactor:
         Q = np.ascontiguousarray(_inverse_of_factor(self.cholesky[outer:, outer:]) * sB[:, None] * sB)
         border = len(sB)
         arguments = []
-        for piece, reduced, formed in zip(pieces, self.reduced, equations.formed, strict=True):
+        blocks = zip(pieces, self.solver.blocks(), self.reduced, equations.formed, strict=True)
+        for piece, block, reduced, formed in blocks:
             own = piece.at[: len(piece.at) - border]
-            arguments.append((reduced, formed, Z[np.ix_(own, own)], X[own], Q, cross))
+            arguments.append((block, reduced, formed, Z[np.ix_(own, own)], X[own], Q, cross))
         parts: list[Inverse] = self.solver.each(of_block.inverse_in, arguments)
         n, k = len(layout.point_free), len(layout.order)
         exterior, mixed = np.empty((poses, 6, 6)), np.empty((first, border))
