@@ -34,7 +34,6 @@ from dask.distributed import (
     Worker,
     WorkerPlugin,
     get_worker,
-    wait,
 )
 from distributed.core import rpc
 from distributed.security import Security
@@ -366,12 +365,16 @@ class DaskEngine:
         """
         try:
             futures = self._start(_in_one_thread, calls, ())
-            someone, waiting = time.monotonic(), True
-            while waiting:
+            done: queue.SimpleQueue[None] = queue.SimpleQueue()
+            for future in futures:
+                future.add_done_callback(lambda _: done.put(None))
+            someone, left = time.monotonic(), len(futures)
+            while left:
+                # not Dask's `wait`: its TimeoutError keeps what the calls took until Python finds the cycle
                 try:
-                    wait(futures, timeout=LOOK_SECONDS)
-                    waiting = False
-                except TimeoutError:
+                    done.get(timeout=LOOK_SECONDS)
+                    left -= 1
+                except queue.Empty:
                     someone = self._last_seen(someone, ADJUSTMENT_AGAIN)
                 for worker in self._lost_workers():
                     self.say(f"worker {worker} was lost; the others compute its blocks again")
@@ -400,11 +403,17 @@ class DaskEngine:
         try:
             if self.client.status not in ("running", "connecting"):
                 raise BackendError(f"the Dask scheduler is gone; {again}")
-            if self.client.nthreads():
+            workers = self.client.scheduler_info(n_workers=-1)["workers"].values()
+            if any(worker["status"] == "running" for worker in workers):
                 return time.monotonic()
         except OSError as error:
             raise BackendError(f"the Dask scheduler is gone; {again}") from error
         if time.monotonic() - someone > NOBODY_SECONDS:
+            if workers:
+                raise BackendError(
+                    f"all workers of the cluster have paused for {NOBODY_SECONDS:.0f} s: their memory is "
+                    "full, and nothing more can be moved to their disks"
+                )
             raise BackendError(f"the Dask scheduler has had no worker for {NOBODY_SECONDS:.0f} s")
         return someone
 

@@ -14,7 +14,9 @@ from sfm.adjustment.datum import Datum
 from sfm.adjustment.engine import iterate
 from sfm.adjustment.engine.iterate import problem_of
 from sfm.adjustment.engine.observed import observed_of
+from sfm.adjustment.engine.solvers import choice
 from sfm.adjustment.engine.solvers.helmert import HelmertSolver
+from sfm.adjustment.engine.solvers.partition import layout_of, partition_of, unpacked
 from sfm.adjustment.engine.unknowns import unknowns_of
 from sfm.adjustment.result import Adjustment
 from sfm.adjustment.solve import AdjustmentOptions, adjust
@@ -27,7 +29,7 @@ from sfm.model.observations.pose import AntennaPositions, ExteriorObservations, 
 from sfm.runtime.executor import Blocking, KeptHere, in_blocks
 from tests.adjustment.test_null_space import in_fronts
 from tests.synthetic import seed_of
-from tests.synthetic_blocks import NOISE_PX, SIZE_PX, aerial, in_sigmas, lens, spoiled
+from tests.synthetic_blocks import NOISE_PX, SIZE_PX, aerial, in_sigmas, lens, spoiled, unordered
 
 TO_THE_END = AdjustmentOptions(tolerance=1e-9)
 EXACT = 1e-9  # rounding; see tests.adjustment.test_multifrontal for that of covariances
@@ -249,3 +251,76 @@ def test_blocks_give_the_adjustment_in_one_piece(name: str) -> None:
         reference = joint_of(whole, points, images)
         here = np.diagonal(reference) > 0
         assert in_sigmas(joint[np.ix_(here, here)], reference[np.ix_(here, here)]) < exact
+
+
+def test_networks_are_cut_where_blocks_save_time_or_their_number_is_stated(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    case = free()
+    layout, _ = unknowns_of(case.network, case.start, use_control=False)
+
+    class TwoWorkers(KeptHere):
+        workers = 2
+
+    assert choice.blocks_of(layout, ()) is None
+    with in_blocks(Blocking(TwoWorkers())):
+        assert choice.blocks_of(layout, ()) is None  # its messages take longer than its steps
+        monkeypatch.setattr(choice, "MESSAGES_SECONDS", 0.0)
+        solver = choice.blocks_of(layout, ())
+        assert solver is not None and len(solver.pieces) == 2
+    with in_blocks(Blocking(KeptHere(), 3)):
+        solver = choice.blocks_of(layout, ())
+        assert solver is not None and len(solver.pieces) == 3
+        inside, start = unordered("no separator", 70, 300, 20)
+        assert choice.blocks_of(unknowns_of(inside, start, use_control=False)[0], ()) is None
+
+
+def test_every_pose_point_and_image_point_has_its_place_in_the_blocks() -> None:
+    """Inner poses, object points and image points are in one block each, and no block sees inside another."""
+    case = controlled()
+    layout, _ = unknowns_of(case.network, case.start, use_control=True)
+    partition = partition_of(layout, 4, np.array([3, 50]))
+    assert partition is not None and {3, 50} <= set(partition.poses.tolist())
+    inner = np.concatenate([piece.poses[: piece.inner] for piece in partition.pieces])
+    assert np.array_equal(np.sort(np.append(inner, partition.poses)), np.arange(len(layout.pose_free)))
+    rays = np.concatenate([piece.rays for piece in partition.pieces])
+    assert np.array_equal(np.sort(rays), np.arange(len(layout.order)))
+    counts = np.bincount(np.concatenate([piece.points for piece in partition.pieces]))
+    assert len(layout.kept) == 6
+    assert set(counts[layout.kept]) == {4} and set(np.delete(counts, layout.kept)) == {1}
+    for piece in partition.pieces:
+        own = unpacked(layout_of(layout, piece)).observations
+        o = layout.observations
+        assert np.array_equal(piece.poses[own.pose], o.pose[piece.rays])
+        assert np.array_equal(piece.points[own.point], o.point[piece.rays])
+        assert np.array_equal(own.whitening, o.whitening[piece.rays])
+        assert np.array_equal(piece.columns[6 * piece.inner :], partition.columns[piece.at])
+
+
+def test_what_a_flat_nadir_block_leaves_open_is_found_in_blocks_too() -> None:
+    """Null vectors beyond the datum, some of which only the camera and all blocks together have."""
+    network, truth = aerial("flat", 6, 14, 1700, tilt=0.0, hills=0.0, noise_px=0.0)
+    with in_blocks(Blocking(KeptHere(), 4)):
+        a = adjust(network, truth, reject="none")
+    assert a.defect == 10 and len(a.undetermined) == 3
+    assert any("c of camera A" in words for words in a.undetermined)
+
+
+def test_a_photograph_that_nothing_determines_is_found_inside_a_block() -> None:
+    """Two points, one of them measured twice, leave two directions of an inner photograph open."""
+    network, truth = aerial("loose", 6, 14, 1700)
+    layout, _ = unknowns_of(network, truth, use_control=False)
+    partition = partition_of(layout, 2, np.zeros(0, dtype=np.int64))
+    assert partition is not None
+    loose = int(partition.pieces[1].poses[3])
+    seen = np.flatnonzero(network.image_points.image == loose)
+    left = np.append(np.delete(np.arange(len(network.image_points)), seen[2:]), seen[1])
+    network = replace(network, image_points=network.image_points.select(left))
+    case = Case(network, truth, {"reject": "none"})
+    whole, blocks = in_this_process(case, None), in_this_process(case, 2)
+    assert blocks.defect == whole.defect
+    for a in (blocks, whole):  # any two directions span what is open
+        assert sum(f"of photograph {loose}" in words for words in a.undetermined) == 2
+    others = np.delete(np.arange(len(network.images)), loose)
+    sigma = sigmas(whole.covariance.exterior[others])[:, :3]
+    assert (np.abs(blocks.estimate.position - whole.estimate.position)[others] / sigma).max() < 1e-6
