@@ -13,7 +13,7 @@ import signal
 import sys
 import time
 import uuid
-from collections.abc import Callable, Iterable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator
 from concurrent.futures import CancelledError
 from contextlib import AbstractContextManager, ExitStack, contextmanager, suppress
 from dataclasses import dataclass, field, fields, is_dataclass
@@ -290,6 +290,7 @@ class DaskEngine:
                     return
                 try:
                     kind, what = events.get(timeout=LOOK_SECONDS)
+                    someone = time.monotonic()
                 except queue.Empty:
                     someone = self._last_seen(someone, BATCH_AGAIN)
                     continue
@@ -324,37 +325,22 @@ class DaskEngine:
         return [submit(work.whole, "whole", parts), *parts]
 
     def keep(self, calls: Iterable[Call]) -> list[Future[Any]]:
-        """Start calls and return where their results are kept, see sfm.runtime.executor.Keeper.
+        """Start calls and return where their results are kept, see sfm.runtime.executor.Keeper."""
+        return self._start(_kept, calls)
 
-        Calls that take nothing kept go to one worker after the other; all others follow their data.
+    def _start(self, way: Callable[..., Any], calls: Iterable[Call]) -> list[Future[Any]]:
+        """Submit calls that are made in some way.
+
+        Dask gives those that take nothing kept to one idle worker after the other, and lets all others follow
+        their data. A preferred worker cannot be stated: if all have died, Dask waits for that one forever.
         """
-        try:
-            workers = sorted(self.client.nthreads())
-        except OSError as error:
-            raise BackendError(f"the Dask scheduler is gone; {ADJUSTMENT_AGAIN}") from error
-        return self._start(_kept, calls, workers)
-
-    def _start(
-        self, way: Callable[..., Any], calls: Iterable[Call], workers: Sequence[str]
-    ) -> list[Future[Any]]:
-        """Submit calls that are made in some way."""
-        futures = []
         with dask.config.set({"distributed.admin.large-graph-warning-threshold": f"{sys.maxsize}B"}):
-            for place, call in enumerate(calls):
-                begins = not any(isinstance(argument, Future) for argument in call.arguments)
-                where = [workers[place % len(workers)]] if begins and workers else None
-                futures.append(
-                    self.client.submit(
-                        way,
-                        call.function,
-                        *call.arguments,
-                        key=f"block-{uuid.uuid4().hex}",
-                        workers=where,
-                        allow_other_workers=where is not None,
-                        pure=False,
-                    )
+            return [
+                self.client.submit(
+                    way, call.function, *call.arguments, key=f"block-{uuid.uuid4().hex}", pure=False
                 )
-        return futures
+                for call in calls
+            ]
 
     def fetch(self, calls: Iterable[Call]) -> list[Any]:
         """Return the results of calls, see sfm.runtime.executor.Keeper.
@@ -364,7 +350,7 @@ class DaskEngine:
             KolinearError: an error raised by a called function.
         """
         try:
-            futures = self._start(_in_one_thread, calls, ())
+            futures = self._start(_in_one_thread, calls)
             done: queue.SimpleQueue[None] = queue.SimpleQueue()
             for future in futures:
                 future.add_done_callback(lambda _: done.put(None))
@@ -373,7 +359,7 @@ class DaskEngine:
                 # not Dask's `wait`: its TimeoutError keeps what the calls took until Python finds the cycle
                 try:
                     done.get(timeout=LOOK_SECONDS)
-                    left -= 1
+                    someone, left = time.monotonic(), left - 1
                 except queue.Empty:
                     someone = self._last_seen(someone, ADJUSTMENT_AGAIN)
                 for worker in self._lost_workers():
@@ -399,22 +385,24 @@ class DaskEngine:
                 yield self.losses.get_nowait()
 
     def _last_seen(self, someone: float, again: str) -> float:
-        """Return when a worker was last seen; raise BackendError if that is too long ago."""
+        """Return when a worker was last seen at work; raise BackendError if that is too long ago."""
         try:
             if self.client.status not in ("running", "connecting"):
                 raise BackendError(f"the Dask scheduler is gone; {again}")
-            workers = self.client.scheduler_info(n_workers=-1)["workers"].values()
-            if any(worker["status"] == "running" for worker in workers):
-                return time.monotonic()
+            workers = self.client.scheduler_info(n_workers=-1)["workers"]
+            busy = {address for address, keys in self.client.processing().items() if keys}
         except OSError as error:
             raise BackendError(f"the Dask scheduler is gone; {again}") from error
+        # one that is paused keeps its work, but does not begin it
+        if any(address in busy and worker["status"] == "running" for address, worker in workers.items()):
+            return time.monotonic()
         if time.monotonic() - someone > NOBODY_SECONDS:
-            if workers:
-                raise BackendError(
-                    f"all workers of the cluster have paused for {NOBODY_SECONDS:.0f} s: their memory is "
-                    "full, and nothing more can be moved to their disks"
-                )
-            raise BackendError(f"the Dask scheduler has had no worker for {NOBODY_SECONDS:.0f} s")
+            if not workers:
+                raise BackendError(f"the Dask scheduler has had no worker for {NOBODY_SECONDS:.0f} s")
+            raise BackendError(
+                f"no worker of the cluster has worked for {NOBODY_SECONDS:.0f} s: their memory is full, and "
+                "nothing more can be moved to their disks"
+            )
         return someone
 
 
