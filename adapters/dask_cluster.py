@@ -371,7 +371,7 @@ class DaskEngine:
             ) from error
         except KilledWorker as error:
             raise BackendError(
-                f"{DIED} with a block of the network; use workers with more memory, or more of them"
+                f"{DIED}, while they computed a block of the network; use more workers, or more memory"
             ) from error
         except ImportError as error:
             raise BackendError(

@@ -21,7 +21,7 @@ from sfm.adjustment.engine.solvers.helmert import HelmertSolver
 from sfm.adjustment.result import Adjustment
 from sfm.model.errors import BackendError, KolinearError
 from sfm.runtime.executor import Blocking, Call, Keeper, KeptHere, in_blocks
-from tests.commands import refused
+from tests.commands import kolinear, refused
 from tests.places import ROOT
 from tests.surveys import write_observed_survey
 from tests.synthetic_blocks import aerial, run, spoiled
@@ -38,7 +38,7 @@ def two_workers() -> Iterator[DaskEngine]:
 def adjusted(keeper: Keeper, blocks: int) -> Adjustment:
     network, truth = aerial("on dask", 6, 14, 1200)
     with in_blocks(Blocking(keeper, blocks)):
-        return run(network, spoiled(truth, "on dask", 0.25))
+        return run(network, spoiled(truth, "on dask", 0.02))
 
 
 def bits(a: Adjustment) -> tuple[bytes, ...]:
@@ -104,6 +104,16 @@ def test_four_workers_give_the_bits_of_this_process() -> None:
     here = bits(adjusted(KeptHere(), 4))
     with local_engine(4) as engine:
         assert bits(adjusted(engine, 4)) == here
+
+
+@pytest.mark.slow
+def test_a_survey_may_be_given_a_cluster(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    survey = write_observed_survey(tmp_path / "survey", "survey")
+    assert kolinear("adjust", survey, "--out", tmp_path / "here") == 0
+    with scheduler_and_workers(tmp_path) as (address, _):
+        assert kolinear("adjust", survey, "--out", tmp_path / "there", "--cluster", address) == 0
+    points = [(tmp_path / folder / "points.csv").read_bytes() for folder in ("here", "there")]
+    assert points[0] == points[1]
 
 
 @contextmanager

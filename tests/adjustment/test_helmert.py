@@ -232,6 +232,7 @@ def whole_in_fronts(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(iterate, "choose_solver", in_fronts)
 
 
+@pytest.mark.sweep(0, 1, 2, 3, 4, 6)
 @pytest.mark.usefixtures("whole_in_fronts")
 @pytest.mark.parametrize("name", CASES)
 def test_blocks_give_the_adjustment_in_one_piece(name: str) -> None:
