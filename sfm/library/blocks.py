@@ -9,10 +9,8 @@ from collections.abc import Iterator
 from contextlib import AbstractContextManager, contextmanager
 
 from sfm.model.arguments import checked_arguments
-from sfm.model.errors import KolinearError, MissingLibraryError
+from sfm.model.errors import INSTALL_DASK, KolinearError, MissingLibraryError
 from sfm.runtime.executor import Blocking, KeptHere, in_blocks
-
-INSTALL_DASK = "pip install 'dask[distributed]' cryptography, the extra kolinear[cluster]"
 
 
 @checked_arguments()

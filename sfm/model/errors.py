@@ -14,6 +14,8 @@
 Rank, convergence and rejected observations are results, not exceptions.
 """
 
+INSTALL_DASK = "pip install 'dask[distributed]' cryptography, the extra kolinear[cluster]"
+
 
 class KolinearError(Exception):
     """Base class of all errors; the message is one line that states what was found and what was needed."""

@@ -19,8 +19,8 @@ from threadpoolctl import threadpool_limits
 from sfm.cli.options import AllowOutside, Pdf, PicturesMb, Verbose
 from sfm.cli.process import FAILED, compile_first, loading
 from sfm.cli.survey_runs import drafted_beside
-from sfm.library.blocks import INSTALL_DASK
 from sfm.model.errors import (
+    INSTALL_DASK,
     GeometryError,
     KolinearError,
     MissingLibraryError,
