@@ -198,6 +198,8 @@ def test_odd_photographs_among_many_are_no_obstacle() -> None:
     assert connected_parts(copies, 60).max() == 0
     nothing = compare_photographs([NOTHING] * 60)
     assert len(overlapping_pairs(nothing)) == 0
+    single = Features(np.zeros((1, 2)), np.ones(1), np.zeros(1), some[0].descriptor[:1])
+    assert len(overlapping_pairs(compare_photographs([single, *[NOTHING] * 60]))) == 0
 
 
 def test_neighbours_of_many_photographs_are_compared_whatever_they_show() -> None:

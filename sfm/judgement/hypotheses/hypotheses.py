@@ -166,12 +166,13 @@ def _judge_parts(final: Adjustment, unit: str) -> JudgedAssumptions:
             continue
         tested |= images
         causes += [remark_of(plain, cause, unit, WITHOUT) for cause in accepted]
-    joined, names, unchecked = of_all_parts(causes), np.array(network.images), []
+    joined, unchecked = of_all_parts(causes), []
+    names = [[network.images[i] for i in np.flatnonzero(tested == which)] for which in (False, True)]
     if tested.any():
         size = {"parts": len(parts), "most": max(int(part.sum()) for part in parts)}
-        unchecked.append(remark("assumptions_tested", photographs=names[tested], causes=len(joined), **size))
+        unchecked.append(remark("assumptions_tested", photographs=names[True], causes=len(causes), **size))
     if not tested.all():
-        unchecked.append(remark("photographs_untested", photographs=names[~tested]))
+        unchecked.append(remark("photographs_untested", photographs=names[False], most=PART_PHOTOGRAPHS))
     return JudgedAssumptions(joined, tuple(unchecked))
 
 

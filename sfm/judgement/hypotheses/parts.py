@@ -1,10 +1,10 @@
 """Parts of a large network, whose assumptions are tested one after another.
 
-The tests need dense normal equations, whose time grows with the cube of the photographs. A part has
-photographs that show the same points: they follow one another in the order of Cuthill and McKee, which
-numbers neighbours near one another. The level of a question is divided by the number of parts.
+The tests need dense normal equations, whose time grows with the cube of the photographs. A network is halved
+where fewest photographs have points in common, and so are its halves. The level of a question is divided by
+the number of parts. A cause that all parts share has less evidence in each.
 
-Source: Cuthill and McKee (1969), Proc. 24th ACM National Conference (order); Bonferroni's inequality.
+Source: George (1973), SIAM J. Numer. Anal. 10(2) (dissection); Bonferroni's inequality.
 """
 
 from __future__ import annotations
@@ -14,8 +14,9 @@ from dataclasses import replace
 
 import numpy as np
 from scipy.sparse import csr_matrix
-from scipy.sparse.csgraph import reverse_cuthill_mckee
+from scipy.sparse.csgraph import connected_components
 
+from sfm.adjustment.engine.solvers.fronts import halve
 from sfm.model.conventions import BoolArray
 from sfm.model.estimate import Estimate
 from sfm.model.network import ImagePoints, Network
@@ -23,6 +24,7 @@ from sfm.model.reduced_network import reduce_network
 from sfm.model.remarks.remark import Remark, together
 
 MIN_RAYS = 2  # of a point in a part
+LISTS = ("points", "photographs")  # subjects that remarks of several parts have together
 
 
 def parts_of(network: Network, used: BoolArray, most: int) -> list[BoolArray]:
@@ -40,14 +42,21 @@ def parts_of(network: Network, used: BoolArray, most: int) -> list[BoolArray]:
     moment = np.unique(moment, return_inverse=True)[1]
     shape = int(moment.max()) + 1, len(network.points)
     shows = csr_matrix((np.ones(len(seen), np.float32), (moment[seen.image], seen.point)), shape)
-    order = reverse_cuthill_mckee(csr_matrix(shows @ shows.T), symmetric_mode=True)
-    photographs = np.bincount(moment)[order]
-    count = int(np.ceil(len(network.images) / most))
-    # parts as large as one another
-    part = np.minimum(np.cumsum(photographs) * count // (len(network.images) + 1), count - 1)
-    of_moment = np.empty(len(order), dtype=np.int64)
-    of_moment[order] = part
-    return [np.asarray(of_moment[moment] == k) for k in range(count)]
+    together = csr_matrix(shows @ shows.T)
+    photographs = np.bincount(moment).astype(float)
+    parts, left = [], [np.arange(len(photographs))]
+    while left:
+        nodes = left.pop()
+        graph = together[nodes][:, nodes]
+        count, component = connected_components(graph, directed=False)
+        if count > 1:
+            left += [nodes[component == c] for c in range(count)]
+        elif photographs[nodes].sum() > most and len(nodes) > 1:
+            half = halve(graph, photographs[nodes])
+            left += [nodes[half], nodes[~half]]
+        else:
+            parts.append(np.isin(moment, nodes))
+    return parts
 
 
 def reduced_to(
@@ -77,9 +86,10 @@ def reduced_to(
 
 
 def of_all_parts(said: Sequence[Remark]) -> tuple[Remark, ...]:
-    """Return one remark for those of several parts that are of one kind, and of one camera if it has one."""
-    groups: dict[tuple[str, tuple[str, ...]], list[Remark]] = {}
+    """Return one remark for those of several parts that claim the same of other points or photographs."""
+    groups: dict[object, list[Remark]] = {}
     for of_part in said:
-        camera = of_part.names("camera") if "camera" in of_part.subjects else ()
-        groups.setdefault((of_part.kind, camera), []).append(of_part)
+        claim = {role: names for role, names in of_part.subjects.items() if role not in LISTS}
+        signs = tuple((name, quantity.value > 0) for name, quantity in of_part.numbers.items())
+        groups.setdefault((of_part.kind, tuple(claim.items()), signs), []).append(of_part)
     return tuple(together(group) for group in groups.values())

@@ -99,7 +99,7 @@ def _search_cells(
         rng: generator that chooses the centres.
     """
     n = len(every)
-    centres = np.sort(rng.choice(n, int(np.ceil(np.sqrt(CELLS * n))), replace=False))
+    centres = np.sort(rng.choice(n, min(n, int(np.ceil(np.sqrt(CELLS * n)))), replace=False))
     cells = min(CELLS, len(centres))
     transposed = np.ascontiguousarray(every[centres].astype(np.float32).T)
     nearest = np.empty((n, cells), np.int32)

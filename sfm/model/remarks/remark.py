@@ -154,20 +154,14 @@ def kinds_of(remarks: Iterable[Remark]) -> tuple[str, ...]:
 
 
 def together(remarks: Sequence[Remark]) -> Remark:
-    """Return one remark for several of one kind: the subjects of all, and the largest of each number."""
-    roles = dict.fromkeys(role for said in remarks for role in said.subjects)
-    numbers = dict.fromkeys(name for said in remarks for name in said.numbers)
-    return replace(
-        remarks[0],
-        subjects={
-            role: tuple(dict.fromkeys(name for said in remarks for name in said.subjects.get(role, ())))
-            for role in roles
-        },
-        numbers={
-            name: max(
-                (said.numbers[name] for said in remarks if name in said.numbers),
-                key=lambda quantity: quantity.value,
-            )
-            for name in numbers
-        },
+    """Return one remark for several of a kind: the subjects of all, and the numbers of the largest shift."""
+    sizes = ("shift", "distance")
+    largest = max(
+        remarks, key=lambda said: [said.numbers[name].value for name in sizes if name in said.numbers]
     )
+    roles = dict.fromkeys(role for said in remarks for role in said.subjects)
+    subjects = {
+        role: tuple(dict.fromkeys(name for said in remarks for name in said.subjects.get(role, ())))
+        for role in roles
+    }
+    return replace(largest, subjects=subjects)

@@ -55,6 +55,7 @@ NOUNS = {  # subjects of remarks, by their names in the data
     "control": "the control points",
     "coordinates": "Coordinates",
     "coordinates without control": "Coordinates of the network without the control points",
+    "coordinates without the other photographs": "Coordinates of a part of the network",
     "datum": "the datum points",
     "diameters": "the targets with given diameters",
     "observations": "the survey observations",

@@ -114,7 +114,9 @@ def spline_camera(adjustment: Adjustment, camera: int = 0) -> SplinedCalibration
         except GeometryError as error:
             failed.append(error)
             continue
-        if best is not None and finer.gain <= best.gain + (-BARE if best.borne else BARE):
+        if best is not None and (
+            finer.gain <= best.gain + (-BARE if best.borne else BARE) or (best.borne and not finer.borne)
+        ):
             break
         best = finer
     if best is None:
@@ -134,7 +136,9 @@ def _with_knots(adjustment: Adjustment, k: int, knots: int) -> SplinedCalibratio
     start = splined_like(adjustment.estimate.cameras[k], xy, knots)
     pixels = start.parameters[start.plays(Role.FOCAL)].mean()
     K = _correlation(knots)
-    B = _changes(adjustment.estimate.cameras[k], start, xy)
+    present, given = adjustment.estimate.cameras[k], network.interior
+    stated = np.isin(np.arange(len(present.names)), given.parameter[given.camera == k])
+    B = _changes(present, start, xy, np.where(stated, adjustment.interior_sigma(k), np.inf))
     # sigma0 of the parametric model is too large, which only makes the prior narrower, and is removed again
     sigma = WIDEST_PX / (pixels * adjustment.sigma0)
     cameras = list(adjustment.estimate.cameras)
@@ -207,14 +211,20 @@ def _places(camera: Camera, seen: FloatArray) -> tuple[FloatArray, FloatArray]:
     return xy[known], rays[known]
 
 
-def _changes(camera: Camera, start: Camera, seen: FloatArray) -> FloatArray:
+def _changes(camera: Camera, start: Camera, seen: FloatArray, largest: FloatArray) -> FloatArray:
     """Return the changes of a surface that the free parameters of a parametric camera make, (f, q).
 
     Each is as large as its parameter makes it that shifts the image by WIDEST_PX over the format, RMS.
+
+    Args:
+        camera: adjusted.
+        start: the splined camera.
+        seen: image points, px, (k, 2).
+        largest: change of each parameter that is not exceeded, infinite where nothing states it, (p,).
     """
     _, rays = _places(camera, seen)
     shifts = parameter_jacobian(camera, rays)[:, :, camera.free].reshape(2 * len(rays), -1)
-    shifts *= WIDEST_PX / np.sqrt(2 * (shifts**2).mean(axis=0))
+    shifts *= np.minimum(WIDEST_PX / np.sqrt(2 * (shifts**2).mean(axis=0)), largest[camera.free])
     return _surface(start, rays, shifts)
 
 

@@ -261,17 +261,7 @@ def split(graph: csr_matrix) -> tuple[BoolArray, BoolArray, BoolArray] | None:
     m = graph.shape[0]
     rows, columns = np.repeat(np.arange(m), np.diff(graph.indptr)), graph.indices
     best: tuple[BoolArray, BoolArray, BoolArray] | None = None
-    # four coordinates by which photographs can be ordered, (m, 4)
-    indptr, indices = graph.indptr.astype(np.int64), graph.indices.astype(np.int64)
-    a = distances(indptr, indices, int(distances(indptr, indices, 0).argmax()))
-    b = distances(indptr, indices, int(a.argmax()))
-    c = distances(indptr, indices, int(np.minimum(a, b).argmax()))
-    d = distances(indptr, indices, int(c.argmax()))
-    ways = np.stack([a - b, c - d, a + c - b - d, a + d - b - c], axis=1).astype(float)
-    joined = csr_matrix((np.ones(len(indices)), indices, indptr), shape=graph.shape)
-    for _ in range(SMOOTHED):
-        ways = (joined @ ways) / np.maximum(np.diff(indptr), 1)[:, None]
-    for way in ways.T:
+    for way in _ways(graph).T:
         first = np.zeros(m, dtype=bool)
         first[np.argsort(way, kind="stable")[: m // 2]] = True
         cut = first[rows] & ~first[columns]
@@ -283,6 +273,39 @@ def split(graph: csr_matrix) -> tuple[BoolArray, BoolArray, BoolArray] | None:
     if best is None or best[2].sum() > MAX_SEPARATOR * m or not (best[0].any() and best[1].any()):
         return None
     return best
+
+
+def halve(graph: csr_matrix, weight: FloatArray) -> BoolArray:
+    """Return the half of a graph that has the fewest edges to the other half, (m,).
+
+    Nodes at the same place are divided at random, not by their order: photographs of one place by no time.
+
+    Args:
+        graph: as in `split`, of two nodes or more.
+        weight: of each node; the halves have the same weight, to one node, (m,).
+    """
+    m = graph.shape[0]
+    rows, columns = np.repeat(np.arange(m), np.diff(graph.indptr)), graph.indices
+    halves, mixed = np.zeros((4, m), dtype=bool), np.random.default_rng(m).permutation(m)
+    for half, way in zip(halves, _ways(graph).T, strict=True):
+        order = np.lexsort((mixed, np.round(way, 9)))
+        count = int(np.searchsorted(np.cumsum(weight[order]), weight.sum() / 2, side="right"))
+        half[order[: min(max(count, 1), m - 1)]] = True
+    return np.asarray(halves[np.argmin([(half[rows] & ~half[columns]).sum() for half in halves])])
+
+
+def _ways(graph: csr_matrix) -> FloatArray:
+    """Return four coordinates by which photographs can be ordered, (m, 4)."""
+    indptr, indices = graph.indptr.astype(np.int64), graph.indices.astype(np.int64)
+    a = distances(indptr, indices, int(distances(indptr, indices, 0).argmax()))
+    b = distances(indptr, indices, int(a.argmax()))
+    c = distances(indptr, indices, int(np.minimum(a, b).argmax()))
+    d = distances(indptr, indices, int(c.argmax()))
+    ways = np.stack([a - b, c - d, a + c - b - d, a + d - b - c], axis=1).astype(float)
+    joined = csr_matrix((np.ones(len(indices)), indices, indptr), shape=graph.shape)
+    for _ in range(SMOOTHED):
+        ways = (joined @ ways) / np.maximum(np.diff(indptr), 1)[:, None]
+    return np.asarray(ways)
 
 
 @compiled

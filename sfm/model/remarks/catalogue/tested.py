@@ -59,7 +59,7 @@ ROWS = (
     ),
     Tested(
         "photographs_untested",
-        "constant object",
+        "constant object[[ and cameras, in parts of at most {most:photograph}]]",
         "{photographs:photograph}",
         "not tested[[: the test needs {needed:photograph}]]",
     ),
