@@ -159,6 +159,14 @@ def two_networks() -> Case:
     return Case(both, truth, {"reject": "none"})
 
 
+def without_image_points(photographs: int) -> Case:
+    """Some photographs have no image points, such as those whose measurement failed."""
+    network, truth = aerial("helmert empty", 6, 14, 1700)
+    seen = np.flatnonzero(network.image_points.image >= photographs)
+    network = replace(network, image_points=network.image_points.select(seen))
+    return Case(network, spoiled(truth, "helmert", 0.1), {"reject": "none"})
+
+
 CASES: dict[str, Callable[[], Case]] = {
     "free": free,
     "controlled": controlled,
@@ -167,6 +175,8 @@ CASES: dict[str, Callable[[], Case]] = {
     "snooping": lambda: gross_errors("tau"),
     "tukey": lambda: gross_errors("tukey"),
     "two networks": two_networks,
+    "10 photographs without image points": lambda: without_image_points(10),
+    "42 photographs without image points": lambda: without_image_points(42),
 }
 
 
@@ -232,7 +242,7 @@ def whole_in_fronts(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(iterate, "choose_solver", in_fronts)
 
 
-@pytest.mark.sweep(0, 1, 2, 3, 4, 6)
+@pytest.mark.sweep(0, 1, 2, 3, 4, 6, 7)
 @pytest.mark.usefixtures("whole_in_fronts")
 @pytest.mark.parametrize("name", CASES)
 def test_blocks_give_the_adjustment_in_one_piece(name: str) -> None:
@@ -274,6 +284,20 @@ def test_networks_are_cut_where_blocks_save_time_or_their_number_is_stated(
         assert solver is not None and len(solver.pieces) == 3
         inside, start = unordered("no separator", 70, 300, 20)
         assert choice.blocks_of(unknowns_of(inside, start, use_control=False)[0], ()) is None
+
+
+def test_photographs_without_image_points_make_no_blocks() -> None:
+    """However many blocks are wanted: each has image points, and the interface is that of the others."""
+    case = without_image_points(10)
+    layout, _ = unknowns_of(case.network, case.start, use_control=False)
+    for coupled in (np.array([20, 50]), np.array([3, 20])):
+        partition = partition_of(layout, 50, coupled)
+        assert partition is not None
+        assert min(len(piece.rays) for piece in partition.pieces) > 0
+        aside = np.setdiff1d(np.arange(10), coupled)
+        assert np.isin(aside, partition.pieces[0].poses[: partition.pieces[0].inner]).all()
+        assert np.isin(coupled, partition.poses).all()
+    assert partition_of(layout, 50, np.arange(84)) is None  # all are at the interface
 
 
 def test_every_pose_point_and_image_point_has_its_place_in_the_blocks() -> None:

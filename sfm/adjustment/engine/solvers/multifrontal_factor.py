@@ -168,7 +168,7 @@ def inverse_of(
     """
     b, observations, (X, Q) = equations.blocks, equations.layout.observations, by_border
     border, XQ = len(Q), X @ Q
-    n, most = len(b.y), int(np.diff(observations.start).max())
+    n, most = len(b.y), int(np.diff(observations.start).max(initial=0))
     core, exterior = np.zeros((n, 3, 3)), np.empty((len(b.U), 6, 6))
     YQ = np.zeros((len(b.Y) if cross else most, 3, 6))
     YQ_border = np.zeros((n if cross else 1, 3, border))

@@ -6,6 +6,9 @@ photographs and object points by itself. The photographs of the interface, inter
 kept points are common to all blocks. Photographs that observations couple with one another belong to the
 interface, too.
 
+Photographs without image points are set aside before the network is cut, and are inner photographs of the
+first block.
+
 An object point belongs to the block of its inner photographs. The image points of a kept point go with their
 photographs, because its coordinates are common.
 
@@ -95,11 +98,11 @@ def partition_of(layout: Unknowns, count: int, coupled: IntArray) -> Partition |
         count: number of blocks; there are fewer if small separators are rare.
         coupled: poses that observations couple with one another.
     """
-    block = _blocks_of_poses(graph_of(layout.observations, layout.kept), count, coupled)
+    o, first = layout.observations, layout.pose_free.size
+    block = _blocks_of_poses(graph_of(o, layout.kept), np.unique(o.pose), count, coupled)
     blocks = int(block.max(initial=-1)) + 1
     if blocks < 2:
         return None
-    o, first = layout.observations, layout.pose_free.size
     kept = np.zeros(len(layout.point_free), dtype=bool)
     kept[layout.kept] = True
     interface = np.flatnonzero(block < 0)
@@ -129,11 +132,17 @@ def partition_of(layout: Unknowns, count: int, coupled: IntArray) -> Partition |
     return Partition(tuple(pieces), interface, columns)
 
 
-def _blocks_of_poses(graph: csr_matrix, count: int, coupled: IntArray) -> IntArray:
-    """Return the block of each pose, -1 at the interface; the largest block is cut until there are enough."""
-    rest = np.ones(graph.shape[0], dtype=bool)
-    rest[coupled] = False
-    parts, whole = [np.flatnonzero(rest)], list[IntArray]()
+def _blocks_of_poses(graph: csr_matrix, seeing: IntArray, count: int, coupled: IntArray) -> IntArray:
+    """Return the block of each pose, -1 at the interface; the largest block is cut until there are enough.
+
+    Args:
+        graph: nonzero where two poses see a point that is eliminated, (poses, poses).
+        seeing: poses with image points; the others are no reason to cut.
+        count: number of blocks.
+        coupled: poses that observations couple with one another.
+    """
+    to_cut = np.setdiff1d(seeing, coupled)
+    parts, whole = [to_cut] if len(to_cut) else [], list[IntArray]()
     while parts and len(parts) + len(whole) < count:
         largest = parts.pop(int(np.argmax([len(part) for part in parts])))
         halves = split(graph[largest][:, largest])
@@ -141,7 +150,8 @@ def _blocks_of_poses(graph: csr_matrix, count: int, coupled: IntArray) -> IntArr
             whole.append(largest)
         else:
             parts += [largest[half] for half in halves[:2]]
-    block = np.full(graph.shape[0], -1)
+    block = np.zeros(graph.shape[0], dtype=np.int64)
+    block[seeing] = block[coupled] = -1
     for b, part in enumerate(sorted(parts + whole, key=lambda part: int(part[0]))):
         block[part] = b
     return block
