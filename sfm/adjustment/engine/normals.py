@@ -18,6 +18,7 @@ from dataclasses import dataclass
 from typing import NamedTuple, Protocol
 
 import numpy as np
+from scipy.sparse import csr_matrix
 
 from sfm.adjustment.engine.accumulate import (
     RESIDUAL,
@@ -54,7 +55,7 @@ class Parts(NamedTuple):
 
     border: FloatArray  # X0, w of poses x interior unknowns, mounts and kept points, (6 poses, i + 3 s)
     corner: FloatArray  # interior unknowns, mounts and kept points, (i + 3 s, i + 3 s)
-    coupled: FloatArray | None  # poses x poses, from observations of two poses; None without, (6 poses,) * 2
+    coupled: csr_matrix | None  # poses x poses, from observations of two poses; None without, (6 poses,) * 2
     g: FloatArray  # reduced right-hand side, (reduced,)
     scale: FloatArray  # 1/sqrt of the diagonal of U, (reduced,)
 

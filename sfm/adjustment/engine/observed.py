@@ -15,6 +15,7 @@ from dataclasses import dataclass
 from typing import NamedTuple, Protocol
 
 import numpy as np
+from scipy.sparse import csr_matrix
 
 from sfm.adjustment.engine.collinearity import State
 from sfm.adjustment.engine.unknowns import Unknowns
@@ -198,7 +199,7 @@ class Terms:
 
     def add_to(
         self, U: FloatArray, border: FloatArray, corner: FloatArray, g: FloatArray
-    ) -> FloatArray | None:
+    ) -> csr_matrix | None:
         """Add J'P J and J'P l to the blocks of the reduced normal equations.
 
         Args:
@@ -210,7 +211,7 @@ class Terms:
         Returns:
             The terms that couple poses with one another, (6 poses, 6 poses); None without such terms.
         """
-        first, coupled = 6 * len(U), None
+        first, coupled = 6 * len(U), list[csr_matrix]()
         for (columns, J, l), JP in self.rows:
             N = JP @ J
             np.add.at(g, columns, np.einsum("nud,nd->nu", JP, l))
@@ -226,9 +227,8 @@ class Terms:
             same = r // 6 == c // 6
             np.add.at(U, (r[same] // 6, r[same] % 6, c[same] % 6), value[same])
             if not same.all():
-                coupled = np.zeros((first, first)) if coupled is None else coupled
-                np.add.at(coupled, (r[~same], c[~same]), value[~same])
-        return coupled
+                coupled.append(csr_matrix((value[~same], (r[~same], c[~same])), shape=(first, first)))
+        return sum(coupled[1:], coupled[0]) if coupled else None
 
 
 def terms_of(

@@ -199,8 +199,8 @@ def schur_complement(
         S *= parts.scale
         S *= parts.scale[:, None]
     if parts.coupled is not None:
-        first = len(parts.coupled)
-        of_poses = np.tril(parts.coupled) * parts.scale[:first] * parts.scale[:first, None]
+        first = parts.coupled.shape[0]
+        of_poses = np.tril(parts.coupled.toarray()) * parts.scale[:first] * parts.scale[:first, None]
         S[:first, :first] += of_poses.astype(dtype)
     _add_blocks(b.U, parts.border, parts.corner, parts.scale, 1 + equations.damping, S.T)
     return S.T

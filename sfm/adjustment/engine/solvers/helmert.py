@@ -30,6 +30,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from scipy.linalg import cho_solve
 from scipy.linalg.lapack import dpotrf, dpotri, dtpttr, dtrtrs
+from scipy.sparse import csr_matrix
 
 from sfm.adjustment.datum import Motions
 from sfm.adjustment.engine.collinearity import State
@@ -57,7 +58,7 @@ class Given(NamedTuple):
     U: FloatArray  # poses, (poses, 6, 6)
     border: FloatArray  # poses x border, (6 poses, b)
     corner: FloatArray  # border, (b, b)
-    coupled: FloatArray | None  # poses of the interface with one another, (6 poses, 6 poses)
+    coupled: csr_matrix | None  # poses of the interface with one another, (6 poses, 6 poses)
     g: FloatArray  # right-hand side, (reduced,)
     vPv: float
 
@@ -338,7 +339,7 @@ class HelmertEquations:
             return S
         of_poses = partition.columns[:poses]
         if given.coupled is not None:
-            S[:poses, :poses] = np.tril(given.coupled[np.ix_(of_poses, of_poses)])
+            S[:poses, :poses] = np.tril(given.coupled[np.ix_(of_poses, of_poses)].toarray())
         for i, pose in enumerate(partition.poses):
             S[6 * i : 6 * i + 6, 6 * i : 6 * i + 6] += given.U[pose]
         S[poses:, :poses] = given.border[of_poses].T
