@@ -14,7 +14,7 @@ import sys
 import time
 import uuid
 from collections.abc import Callable, Iterable, Iterator
-from concurrent.futures import CancelledError
+from concurrent.futures import CancelledError, ThreadPoolExecutor
 from contextlib import AbstractContextManager, ExitStack, contextmanager, suppress
 from dataclasses import dataclass, field, fields, is_dataclass
 from itertools import count
@@ -129,7 +129,10 @@ def local_engine(workers: int) -> Iterator[DaskEngine]:
                     local_directory=str(scratch),
                 )
             except (ImportError, OSError, RuntimeError, TimeoutError) as error:
-                raise BackendError(f"{workers} worker processes cannot be started: {_line(error)}") from error
+                raise BackendError(
+                    f"{workers} worker processes cannot be started: {_line(error).rstrip('.')}; "
+                    'a script must start them under if __name__ == "__main__":'
+                ) from error
             stack.callback(_close, cluster)
             stack.enter_context(cluster)
             client = stack.enter_context(Client(cluster))
@@ -169,28 +172,31 @@ def _interrupt_held_back() -> Iterator[None]:
         signal.pthread_sigmask(signal.SIG_SETMASK, before)
 
 
-def remote_engine(address: str) -> AbstractContextManager[DaskEngine]:
+def remote_engine(address: str, option: str) -> AbstractContextManager[DaskEngine]:
     """Use a running scheduler, whose workers must have Kolinear and access to the same folders.
 
     Args:
         address: such as tcp://192.168.1.5:8786. Anybody who reaches a scheduler can run programs on its
             workers, so it belongs in a trusted network. For tls:// Dask's configuration names the
             certificates.
+        option: what the user calls the address, for messages.
 
     Raises:
         BackendError: no scheduler answers; this is checked before anything else starts.
     """
     _silence()
     try:
-        # A Client that cannot connect keeps trying, and reports it half a minute later.
-        asyncio.run(_ask(address))
+        # A Client that cannot connect keeps trying, and reports it half a minute later. The thread of a
+        # notebook already runs an event loop, so the question has a thread of its own.
+        with ThreadPoolExecutor(max_workers=1) as thread:
+            thread.submit(asyncio.run, _ask(address)).result()
     except TimeoutError as error:
         raise BackendError(
-            f"--cluster {address}: no Dask scheduler answers within {CONNECT_SECONDS:.0f} s"
+            f"{option} {address}: no Dask scheduler answers within {CONNECT_SECONDS:.0f} s"
         ) from error
     except (OSError, ValueError, TypeError, AttributeError) as error:
-        raise BackendError(f"--cluster {address}: no Dask scheduler answers ({_line(error)})") from error
-    return _connected(address)
+        raise BackendError(f"{option} {address}: no Dask scheduler answers ({_line(error)})") from error
+    return _connected(address, option)
 
 
 async def _ask(address: str) -> None:
@@ -206,11 +212,11 @@ async def _ask(address: str) -> None:
 
 
 @contextmanager
-def _connected(address: str) -> Iterator[DaskEngine]:
+def _connected(address: str, option: str) -> Iterator[DaskEngine]:
     try:
         client = Client(address, timeout=CONNECT_SECONDS, set_as_default=False)
     except (OSError, ValueError, TypeError, TimeoutError) as error:
-        raise BackendError(f"--cluster {address}: no Dask scheduler answers ({_line(error)})") from error
+        raise BackendError(f"{option} {address}: no Dask scheduler answers ({_line(error)})") from error
     with client, _engine_of(client) as engine:
         yield engine
 

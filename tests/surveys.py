@@ -96,16 +96,21 @@ def write_observed_survey(
     """Write a survey of synthetic image points, a network that depends on the name; return its file."""
     folder.mkdir(parents=True)
     network, _ = make_network(seed_of(name), images=images, points=points, free=("c",))
+    write_image_points(network, folder / "image_points.csv")
+    path = folder / "survey.toml"
+    path.write_text(observed_text(name, "m", backend=backend), encoding="utf-8")
+    return path
+
+
+def write_image_points(network: Network, file: Path) -> None:
+    """Write the image points of a network as the table of a survey."""
     seen = network.image_points
     lines = ["image,point,x_px,y_px"]
     lines += [
         f"{network.images[i]},{network.points[j]},{x!r},{y!r}"
         for i, j, (x, y) in zip(seen.image, seen.point, seen.xy.tolist(), strict=True)
     ]
-    (folder / "image_points.csv").write_text("\n".join(lines) + "\n", encoding="utf-8")
-    path = folder / "survey.toml"
-    path.write_text(observed_text(name, "m", backend=backend), encoding="utf-8")
-    return path
+    file.write_text("\n".join(lines) + "\n", encoding="utf-8")
 
 
 @lru_cache

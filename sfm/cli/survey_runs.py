@@ -73,7 +73,7 @@ def run_survey_file(survey_file: Path, options: RunOptions) -> Path:
         from sfm.cli.console import print_result
         from sfm.files.globs import nearest_name
         from sfm.files.open_folders import refuse_foreign_folder
-        from sfm.library.blocks import helmert_blocks
+        from sfm.library.blocks import blocks_on_dask
         from sfm.library.results import read_result
         from sfm.library.surveys import colmap_writer, programs_of
         from sfm.pipeline import run_survey
@@ -150,7 +150,7 @@ def run_survey_file(survey_file: Path, options: RunOptions) -> Path:
         one_blas_thread(),
         plot_process(jobs) as plots,
         lock_folder(folder),
-        nullcontext() if options.cluster is None else helmert_blocks(cluster=options.cluster),
+        blocks_on_dask(None, options.cluster, None, option="--cluster") if options.cluster else nullcontext(),
         SurveyLog(watch=drawn) as log,
     ):
         history, work = RunHistory.of_user(), work_of(survey, files)

@@ -12,7 +12,7 @@ from __future__ import annotations
 from collections.abc import Callable, Iterable, Iterator
 from contextlib import contextmanager
 from contextvars import ContextVar
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import Any, Protocol
 
 Send = Callable[[dict[str, Any]], None]  # accepts only plain values: text, numbers, lists
@@ -130,12 +130,31 @@ class KeptHere:
         return self.keep(calls)
 
 
+@dataclass
+class Largest:
+    """How the largest network was adjusted while blocks were wanted."""
+
+    image_points: int = 0
+    line: str = ""
+
+    def note(self, image_points: int, line: str) -> None:
+        """Note how a network is adjusted, unless a larger one was before.
+
+        Args:
+            image_points: their number in the network.
+            line: how it is adjusted, for the user.
+        """
+        if image_points >= self.image_points:
+            self.image_points, self.line = image_points, line
+
+
 @dataclass(frozen=True)
 class Blocking:
     """How large networks are adjusted in blocks."""
 
     keeper: Keeper
-    blocks: int | None = None  # number of blocks of every network; None: one a worker, where that saves time
+    blocks: int | None = None  # number of blocks of every network; None: one a thread, where that saves time
+    largest: Largest = field(default_factory=Largest)
 
 
 _blocking: ContextVar[Blocking | None] = ContextVar("blocking", default=None)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import asyncio
 import json
 import os
 import signal
@@ -9,23 +10,33 @@ import subprocess
 import sys
 import time
 from collections.abc import Callable, Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, nullcontext
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import pytest
 
 import sfm
 from adapters.dask_cluster import DaskEngine, local_engine, remote_engine
+from sfm.adjustment.engine.solvers import choice
 from sfm.adjustment.engine.solvers.helmert import HelmertSolver
 from sfm.adjustment.result import Adjustment
+from sfm.model.conventions import FloatArray
 from sfm.model.errors import BackendError, KolinearError
 from sfm.runtime.executor import Blocking, Call, Keeper, KeptHere, in_blocks
 from tests.commands import kolinear, refused
 from tests.places import ROOT
-from tests.surveys import write_observed_survey
-from tests.synthetic_blocks import aerial, run, spoiled
+from tests.surveys import observed_text, write_image_points, write_observed_survey
+from tests.synthetic_blocks import aerial, run, spoiled, unordered
 
+OF_LENS = """\
+name = "A"
+size_px = [2000, 1500]
+pixel_mm = [0.005, 0.005]
+c_mm = 10.0
+fixed = {K1 = -1e-4}
+"""
 THIRD = 3  # factor at which something dies: amid the iteration
 
 
@@ -82,10 +93,72 @@ def test_an_error_in_a_block_is_raised_here(two_workers: DaskEngine) -> None:
 
 
 def test_blocks_that_cannot_be_are_refused() -> None:
+    with pytest.raises(KolinearError, match="helmert_blocks: neither blocks, cluster nor workers"):
+        sfm.helmert_blocks()
     with pytest.raises(KolinearError, match="blocks 0, expected at least 1"):
         sfm.helmert_blocks(0)
     with pytest.raises(KolinearError, match="workers are processes on this computer"):
         sfm.helmert_blocks(workers=2, cluster="tcp://127.0.0.1:1")
+
+
+def test_a_cluster_is_asked_from_a_notebook_and_named_as_there(monkeypatch: pytest.MonkeyPatch) -> None:
+    """The cells of a notebook run within an event loop."""
+    monkeypatch.setattr("adapters.dask_cluster.CONNECT_SECONDS", 0.5)
+
+    async def cell() -> None:
+        with sfm.helmert_blocks(cluster="tcp://127.0.0.1:1"):
+            pass
+
+    with pytest.raises(
+        BackendError, match=r"^helmert_blocks: cluster tcp://127\.0\.0\.1:1: no Dask scheduler"
+    ):
+        asyncio.run(cell())
+
+
+@pytest.mark.parametrize(
+    ("network", "blocks", "messages_seconds", "how"),
+    [
+        ("aerial", None, choice.MESSAGES_SECONDS, "here, since its steps take less time than the messages"),
+        ("aerial", None, 0.0, "in 2 Helmert blocks"),
+        ("aerial", 1, 0.0, "here, since one block is the whole network"),
+        ("around", None, 0.0, "here, since it has no small separator"),
+    ],
+)
+def test_a_line_says_how_the_largest_network_was_adjusted(
+    two_workers: DaskEngine,
+    network: str,
+    blocks: int | None,
+    messages_seconds: float,
+    how: str,
+    monkeypatch: pytest.MonkeyPatch,
+    capfd: pytest.CaptureFixture[str],
+) -> None:
+    monkeypatch.setattr(choice, "MESSAGES_SECONDS", messages_seconds)
+    monkeypatch.setattr("adapters.dask_cluster.local_engine", lambda _: nullcontext(two_workers))
+    small, of_small = aerial("small", 2, 3, 60)
+    observed, truth = (
+        aerial("on dask", 6, 14, 1200) if network == "aerial" else unordered("no separator", 70, 300, 20)
+    )
+    with sfm.helmert_blocks(blocks, workers=2):
+        run(observed, truth, covariance=False)
+        run(small, of_small, covariance=False)
+    (line,) = capfd.readouterr().err.splitlines()
+    assert line.startswith(f"the network of {len(observed.images)} photographs is adjusted {how}")
+
+
+@pytest.mark.slow
+def test_a_script_that_starts_workers_while_it_is_imported_is_told_why(tmp_path: Path) -> None:
+    script = tmp_path / "script.py"
+    script.write_text("import sfm\nwith sfm.helmert_blocks(workers=1):\n    pass\n", encoding="utf-8")
+    ended = subprocess.run(
+        [sys.executable, str(script)],
+        env={**os.environ, "PYTHONPATH": str(ROOT)},
+        capture_output=True,
+        text=True,
+        timeout=120,
+    )
+    assert ended.returncode != 0
+    assert 'a script must start them under if __name__ == "__main__":' in ended.stderr
 
 
 @pytest.mark.slow
@@ -107,13 +180,34 @@ def test_four_workers_give_the_bits_of_this_process() -> None:
 
 
 @pytest.mark.slow
-def test_a_survey_may_be_given_a_cluster(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    survey = write_observed_survey(tmp_path / "survey", "survey")
-    assert kolinear("adjust", survey, "--out", tmp_path / "here") == 0
-    with scheduler_and_workers(tmp_path) as (address, _):
-        assert kolinear("adjust", survey, "--out", tmp_path / "there", "--cluster", address) == 0
-    points = [(tmp_path / folder / "points.csv").read_bytes() for folder in ("here", "there")]
-    assert points[0] == points[1]
+def test_a_survey_may_be_given_a_cluster(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """It is divided among the workers if it is large enough, and a line says which."""
+    network, _ = aerial("given a cluster", 4, 12, 800, tilt=0.2, hills=20.0)
+    survey = tmp_path / "survey" / "survey.toml"
+    survey.parent.mkdir()
+    survey.write_text(observed_text("survey", "m", OF_LENS), encoding="utf-8")
+    write_image_points(network, survey.parent / "image_points.csv")
+    with scheduler_and_workers(tmp_path) as (address, _), remote_engine(address, "--cluster") as engine:
+        engine.client.wait_for_workers(2, timeout=60)
+        said = {}
+        for name, seconds in (("here", choice.MESSAGES_SECONDS), ("there", 0.0)):
+            monkeypatch.setattr(choice, "MESSAGES_SECONDS", seconds)
+            capsys.readouterr()
+            kolinear("adjust", survey, "--out", tmp_path / name, "--cluster", address)
+            lines = capsys.readouterr().err.splitlines()
+            (said[name],) = (line for line in lines if line.startswith("the network of"))
+    assert "is adjusted here, since its steps take less time than the messages of blocks" in said["here"]
+    assert said["there"] == "the network of 48 photographs is adjusted in 2 Helmert blocks"
+    points = [read_points(tmp_path / folder / "points.csv") for folder in ("here", "there")]
+    assert np.allclose(*points, rtol=0, atol=1e-5)  # m; the last digits written
+
+
+def read_points(file: Path) -> FloatArray:
+    """Return the coordinates of a table of object points."""
+    table = np.genfromtxt(file, delimiter=",", names=True, usecols=("X", "Y", "Z"))
+    return np.stack([table[name] for name in ("X", "Y", "Z")], axis=1)
 
 
 @contextmanager
@@ -148,7 +242,10 @@ def test_a_scheduler_that_is_killed_is_one_line_and_starting_again_gives_the_sam
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     here = bits(adjusted(KeptHere(), 2))
-    with scheduler_and_workers(tmp_path) as (address, scheduler), remote_engine(address) as engine:
+    with (
+        scheduler_and_workers(tmp_path) as (address, scheduler),
+        remote_engine(address, "--cluster") as engine,
+    ):
         engine.client.wait_for_workers(2, timeout=60)
         at_third_factor(monkeypatch, scheduler.kill)
         with pytest.raises(BackendError) as error:
@@ -156,7 +253,7 @@ def test_a_scheduler_that_is_killed_is_one_line_and_starting_again_gives_the_sam
     assert "\n" not in str(error.value)
     assert "the Dask scheduler is gone" in str(error.value)
     assert "run again, the result will be the same" in str(error.value)
-    with scheduler_and_workers(tmp_path) as (address, _), remote_engine(address) as engine:
+    with scheduler_and_workers(tmp_path) as (address, _), remote_engine(address, "--cluster") as engine:
         engine.client.wait_for_workers(2, timeout=60)
         assert bits(adjusted(engine, 2)) == here
 

@@ -177,7 +177,7 @@ def batch_engine(
         return nullcontext(InProcess())
     engine: AbstractContextManager[Engine]
     if cluster is not None:
-        engine = dask.remote_engine(cluster)
+        engine = dask.remote_engine(cluster, "--cluster")
     else:
         engine = dask.local_engine(min(jobs or dask.fitting_workers(), busy()))
     return engine

@@ -595,7 +595,7 @@ def test_nobody_at_the_address_of_a_cluster_is_known_at_once(
     monkeypatch.setattr("adapters.dask_cluster.CONNECT_SECONDS", 0.5)
     begun = time.perf_counter()
     with pytest.raises(BackendError, match=f"--cluster {address}: no Dask scheduler answers.*{told}"):
-        remote_engine(address)
+        remote_engine(address, "--cluster")
     gc.collect()  # what is not done with says so when it is thrown away
     assert time.perf_counter() - begun < 10  # it was 30 s and more
     assert capfd.readouterr().err == ""
@@ -626,7 +626,7 @@ def test_a_scheduler_started_separately_gives_the_same_bytes(
                 stderr=subprocess.DEVNULL,
             )
         )
-        with remote_engine(scheduler) as engine:
+        with remote_engine(scheduler, "--cluster") as engine:
             engine.client.wait_for_workers(2, timeout=60)
             assert engine.workers == 2
             rows = run_batch(surveys, tmp_path / "out", nullcontext(engine), ALONE, Notes())

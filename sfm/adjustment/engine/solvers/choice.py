@@ -92,12 +92,18 @@ def blocks_of(layout: Unknowns, observed: tuple[ObservedKind, ...]) -> HelmertSo
     blocking = current_blocking()
     if blocking is None:
         return None
-    count = blocking.blocks
-    if count is None:
-        count, k = blocking.keeper.workers, len(layout.order)
-        if k * IMAGE_POINT_SECONDS * (1 - 1 / count) < MESSAGES_SECONDS:
-            return None
-    partition = partition_of(layout, count, coupled_poses(observed, layout))
+    count, k, partition = blocking.blocks or blocking.keeper.workers, len(layout.order), None
+    if count < 2:
+        how = "here, since one block is the whole network"
+    elif blocking.blocks is None and k * IMAGE_POINT_SECONDS * (1 - 1 / count) < MESSAGES_SECONDS:
+        how = "here, since its steps take less time than the messages of blocks"
+    else:
+        partition = partition_of(layout, count, coupled_poses(observed, layout))
+        how = "here, since it has no small separator"
+        if partition is not None:
+            how = f"in {len(partition.pieces)} Helmert blocks"
+    photographs = counted(len(layout.observations.pose_of), "photograph")
+    blocking.largest.note(k, f"the network of {photographs} is adjusted {how}")
     return None if partition is None else HelmertSolver(layout, observed, partition, blocking.keeper)
 
 
