@@ -133,8 +133,6 @@ def read_tables(survey: Survey, tables: tuple[Observations, ...], files: Photogr
         reason = remark("image_points_contradicting", image_points=name)
         left_out.append(LeftOutPoint(name, times[i, j], reason))
     left_out += [LeftOutPoint(name, 1, remark("image_points_outside", image_points=name)) for name in gross]
-    # nobody can correct matches that are numbered anew
-    repeated = merged.remarks(images, points) if all(table.names_last for table in tables) else ()
     outside_remark = (remark("image_points_outside", image_points=gross),) if gross else ()
     return Measurements(
         network,
@@ -143,7 +141,7 @@ def read_tables(survey: Survey, tables: tuple[Observations, ...], files: Photogr
         np.full(len(points), MIN_RAYS),
         failed,
         _overlays(network, files, readable),
-        remarks=(*offsets, *repeated, *outside_remark),
+        remarks=(*offsets, *merged.remarks(images, points), *outside_remark),
         left_out=tuple(left_out),
     )
 
@@ -159,9 +157,14 @@ def _used_photographs(images: Sequence[str], files: PhotographList, copies: Coll
 def _merge_tables(
     seen: ImagePoints, tables: Sequence[Observations]
 ) -> tuple[MergedImagePoints, tuple[Remark, ...]]:
-    """Merge what a table has several times, and use the first of tables that have the same image point."""
+    """Merge what a table has several times, and use the first of tables that have the same image point.
+
+    Of matches, which are numbered anew in each run, nobody is told.
+    """
     if len(tables) == 1:
-        return merge_repeated(replace(seen, source=None)), ()
+        merged_table = merge_repeated(replace(seen, source=None))
+        told = tables[0].names_last
+        return (merged_table if told else replace(merged_table, same=(), averaged=())), ()
     of_table = np.zeros(len(seen), dtype=np.int64) if seen.source is None else seen.source
     merged = [merge_repeated(seen.select(np.asarray(of_table == k))) for k in range(len(tables))]
     every = ImagePoints.joined([part.image_points for part in merged])
