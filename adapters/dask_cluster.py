@@ -17,6 +17,7 @@ from collections.abc import Callable, Iterable, Iterator
 from concurrent.futures import CancelledError, ThreadPoolExecutor
 from contextlib import AbstractContextManager, ExitStack, contextmanager, suppress
 from dataclasses import dataclass, field, fields, is_dataclass
+from importlib import import_module
 from itertools import count
 from multiprocessing import resource_tracker
 from threading import Lock
@@ -173,7 +174,7 @@ def _interrupt_held_back() -> Iterator[None]:
 
 
 def remote_engine(address: str, option: str) -> AbstractContextManager[DaskEngine]:
-    """Use a running scheduler, whose workers must have Kolinear and access to the same folders.
+    """Use a running scheduler, which must have Kolinear, with workers that have it and the same folders.
 
     Args:
         address: such as tcp://192.168.1.5:8786. Anybody who reaches a scheduler can run programs on its
@@ -182,26 +183,36 @@ def remote_engine(address: str, option: str) -> AbstractContextManager[DaskEngin
         option: what the user calls the address, for messages.
 
     Raises:
-        BackendError: no scheduler answers; this is checked before anything else starts.
+        BackendError: no scheduler answers, or a certificate cannot be read; this is checked before anything
+            else starts.
     """
     _silence()
+    security = Security()
+    try:
+        credentials = security.get_connection_args("client")
+    except OSError as error:  # of a missing file, or of one that is no certificate; neither names it
+        named = {file: None for file in security.get_tls_config_for_role("client").values() if file}
+        raise BackendError(
+            f"{option} {address}: a certificate of Dask's configuration cannot be read: "
+            f"{', '.join(named)} ({_line(error)})"
+        ) from error
     try:
         # A Client that cannot connect keeps trying, and reports it half a minute later. The thread of a
         # notebook already runs an event loop, so the question has a thread of its own.
         with ThreadPoolExecutor(max_workers=1) as thread:
-            thread.submit(asyncio.run, _ask(address)).result()
+            thread.submit(asyncio.run, _ask(address, credentials)).result()
     except TimeoutError as error:
         raise BackendError(
             f"{option} {address}: no Dask scheduler answers within {CONNECT_SECONDS:.0f} s"
         ) from error
-    except (OSError, ValueError, TypeError, AttributeError) as error:
+    # RuntimeError: the address is without encryption, and Dask's configuration requires it
+    except (OSError, ValueError, TypeError, AttributeError, RuntimeError) as error:
         raise BackendError(f"{option} {address}: no Dask scheduler answers ({_line(error)})") from error
     return _connected(address, option)
 
 
-async def _ask(address: str) -> None:
+async def _ask(address: str, credentials: dict[str, Any]) -> None:
     """Ask the server at an address whether it is a scheduler; ValueError if not."""
-    credentials = Security().get_connection_args("client")
     async with (
         asyncio.timeout(CONNECT_SECONDS),
         rpc(address, timeout=CONNECT_SECONDS, connection_args=credentials) as server,
@@ -217,8 +228,15 @@ def _connected(address: str, option: str) -> Iterator[DaskEngine]:
         client = Client(address, timeout=CONNECT_SECONDS, set_as_default=False)
     except (OSError, ValueError, TypeError, TimeoutError) as error:
         raise BackendError(f"{option} {address}: no Dask scheduler answers ({_line(error)})") from error
-    with client, _engine_of(client) as engine:
-        yield engine
+    with client:
+        try:  # it reads the work that it hands out, and Dask's error about that has several lines
+            client.run_on_scheduler(import_module, __name__)
+        except ImportError as error:
+            raise BackendError(
+                f"{option} {address}: scheduler and workers of a cluster need Kolinear: {_line(error)}"
+            ) from error
+        with _engine_of(client) as engine:
+            yield engine
 
 
 @contextmanager

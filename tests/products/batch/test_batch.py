@@ -18,6 +18,7 @@ from http.client import HTTPException
 from pathlib import Path
 from urllib.request import urlopen
 
+import dask
 import psutil
 import pytest
 from dask.distributed import KilledWorker
@@ -599,6 +600,55 @@ def test_nobody_at_the_address_of_a_cluster_is_known_at_once(
     gc.collect()  # what is not done with says so when it is thrown away
     assert time.perf_counter() - begun < 10  # it was 30 s and more
     assert capfd.readouterr().err == ""
+
+
+def test_an_address_that_the_encryption_of_dask_refuses_is_one_line() -> None:
+    address = "tcp://127.0.0.1:1"
+    with (
+        dask.config.set({"distributed.comm.require-encryption": True}),
+        pytest.raises(
+            BackendError, match=f"--cluster {address}: no Dask scheduler answers.*encryption required"
+        ),
+    ):
+        remote_engine(address)
+
+
+@pytest.mark.parametrize("written", [None, "no certificate"])
+def test_a_certificate_that_cannot_be_read_is_named(written: str | None, tmp_path: Path) -> None:
+    certificate = tmp_path / "cert.pem"
+    if written is not None:
+        certificate.write_text(written, encoding="utf-8")
+    with (
+        dask.config.set(
+            {f"distributed.comm.tls.{key}": str(certificate) for key in ("ca-file", "client.cert")}
+        ),
+        pytest.raises(BackendError, match="a certificate of Dask's configuration cannot be read") as error,
+    ):
+        remote_engine("tls://127.0.0.1:1")
+    assert str(certificate) in str(error.value)
+
+
+def test_a_scheduler_without_kolinear_is_one_line(tmp_path: Path) -> None:
+    file = tmp_path / "scheduler.json"
+    without = (
+        "import sys; sys.modules['adapters'] = None; from distributed.cli.dask_scheduler import main; main()"
+    )
+    options = ["--host", "127.0.0.1", "--port", "0", "--no-dashboard", "--scheduler-file", str(file)]
+    running = subprocess.Popen([sys.executable, "-c", without, *options], stderr=subprocess.DEVNULL)
+    try:
+        while not file.exists():
+            assert running.poll() is None
+            time.sleep(0.1)
+        address = json.loads(file.read_text(encoding="utf-8"))["address"]
+        with (
+            pytest.raises(BackendError, match="scheduler and workers of a cluster need Kolinear") as error,
+            remote_engine(address),
+        ):
+            pass
+        assert "\n" not in str(error.value) and "adapters" in str(error.value)
+    finally:
+        running.terminate()
+        running.wait(timeout=20)
 
 
 @pytest.mark.slow
