@@ -231,6 +231,9 @@ def _connected(address: str, option: str) -> Iterator[DaskEngine]:
     with client:
         try:  # it reads the work that it hands out, and Dask's error about that has several lines
             client.run_on_scheduler(import_module, __name__)
+            for answer in client.run(import_module, __name__, on_error="return").values():
+                if isinstance(answer, ImportError):  # a worker would end by it, without a word
+                    raise answer
         except ImportError as error:
             raise BackendError(
                 f"{option} {address}: scheduler and workers of a cluster need Kolinear: {_line(error)}"

@@ -21,7 +21,7 @@ from urllib.request import urlopen
 import dask
 import psutil
 import pytest
-from dask.distributed import KilledWorker
+from dask.distributed import Client, KilledWorker
 from rich.console import Console
 from threadpoolctl import threadpool_info, threadpool_limits
 
@@ -628,18 +628,27 @@ def test_a_certificate_that_cannot_be_read_is_named(written: str | None, tmp_pat
     assert str(certificate) in str(error.value)
 
 
-def test_a_scheduler_without_kolinear_is_one_line(tmp_path: Path) -> None:
+@pytest.mark.parametrize("lacking", ["scheduler", "worker"])
+def test_a_cluster_without_kolinear_is_one_line(lacking: str, tmp_path: Path) -> None:
     file = tmp_path / "scheduler.json"
-    without = (
-        "import sys; sys.modules['adapters'] = None; from distributed.cli.dask_scheduler import main; main()"
-    )
-    options = ["--host", "127.0.0.1", "--port", "0", "--no-dashboard", "--scheduler-file", str(file)]
-    running = subprocess.Popen([sys.executable, "-c", without, *options], stderr=subprocess.DEVNULL)
+    options = ["--no-dashboard", "--scheduler-file", str(file)]
+
+    def start(part: str, *more: str) -> subprocess.Popen[bytes]:
+        hidden = "sys.modules['adapters'] = None; " if part == lacking else ""
+        program = f"import sys; {hidden}from distributed.cli.dask_{part} import main; main()"
+        command = [sys.executable, "-c", program, "--host", "127.0.0.1", *options, *more]
+        return subprocess.Popen(command, cwd=ROOT, stderr=subprocess.DEVNULL)
+
+    running = [start("scheduler", "--port", "0")]
     try:
         while not file.exists():
-            assert running.poll() is None
+            assert running[0].poll() is None
             time.sleep(0.1)
         address = json.loads(file.read_text(encoding="utf-8"))["address"]
+        if lacking == "worker":
+            running.append(start("worker", "--no-nanny", "--nthreads", "1"))
+            with Client(address, set_as_default=False) as client:
+                client.wait_for_workers(1, timeout=60)
         with (
             pytest.raises(BackendError, match="scheduler and workers of a cluster need Kolinear") as error,
             remote_engine(address),
@@ -647,8 +656,9 @@ def test_a_scheduler_without_kolinear_is_one_line(tmp_path: Path) -> None:
             pass
         assert "\n" not in str(error.value) and "adapters" in str(error.value)
     finally:
-        running.terminate()
-        running.wait(timeout=20)
+        for process in reversed(running):
+            process.terminate()
+            process.wait(timeout=20)
 
 
 @pytest.mark.slow
