@@ -610,7 +610,7 @@ def test_an_address_that_the_encryption_of_dask_refuses_is_one_line() -> None:
             BackendError, match=f"--cluster {address}: no Dask scheduler answers.*encryption required"
         ),
     ):
-        remote_engine(address)
+        remote_engine(address, "--cluster")
 
 
 @pytest.mark.parametrize("written", [None, "no certificate"])
@@ -624,7 +624,7 @@ def test_a_certificate_that_cannot_be_read_is_named(written: str | None, tmp_pat
         ),
         pytest.raises(BackendError, match="a certificate of Dask's configuration cannot be read") as error,
     ):
-        remote_engine("tls://127.0.0.1:1")
+        remote_engine("tls://127.0.0.1:1", "--cluster")
     assert str(certificate) in str(error.value)
 
 
@@ -651,7 +651,7 @@ def test_a_cluster_without_kolinear_is_one_line(lacking: str, tmp_path: Path) ->
                 client.wait_for_workers(1, timeout=60)
         with (
             pytest.raises(BackendError, match="scheduler and workers of a cluster need Kolinear") as error,
-            remote_engine(address),
+            remote_engine(address, "--cluster"),
         ):
             pass
         assert "\n" not in str(error.value) and "adapters" in str(error.value)
