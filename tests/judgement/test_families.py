@@ -301,7 +301,7 @@ def test_of_a_large_network_the_points_of_most_rays_are_taken(monkeypatch: pytes
     seen = a.network.image_points
     rays = np.bincount(seen.point)
     monkeypatch.setattr(hypotheses, "MAX_IMAGE_POINTS", 60)
-    network, estimate, rows = hypotheses._sample(a.network, a.estimate)
+    network, estimate, rows = hypotheses._sample(a.network, a.estimate, hypotheses.MAX_IMAGE_POINTS)
     assert len(seen) > 60 and len(network.images) == 6
     kept = np.isin(a.network.points, network.points)
     count = np.bincount(seen.image[rows], minlength=6)
@@ -311,7 +311,7 @@ def test_of_a_large_network_the_points_of_most_rays_are_taken(monkeypatch: pytes
     np.testing.assert_array_equal(estimate.points, a.estimate.points[kept])
     np.testing.assert_array_equal(network.image_points.xy, seen.xy[rows])
     monkeypatch.setattr(hypotheses, "MAX_IMAGE_POINTS", len(seen))
-    assert hypotheses._sample(a.network, a.estimate)[2].all()
+    assert hypotheses._sample(a.network, a.estimate, hypotheses.MAX_IMAGE_POINTS)[2].all()
 
 
 def test_very_many_photographs_are_tested_in_parts(a: Adjustment, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -279,7 +279,7 @@ def large(m: int, each: int) -> tuple[Network, Estimate]:
 def test_networks_of_some_thousand_image_points_are_tested_whole(each: int, whole: bool) -> None:
     """5,000 image points are, of 9,000 and 20,000 a sample, of which each photograph has its share."""
     network, estimate = large(5, each)
-    part, start, rows = hypotheses._sample(network, estimate)
+    part, start, rows = hypotheses._sample(network, estimate, hypotheses.MAX_IMAGE_POINTS)
     assert rows.all() == whole and len(start.points) == len(part.points)
     if not whole:
         count = np.bincount(part.image_points.image)

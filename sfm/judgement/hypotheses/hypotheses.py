@@ -66,7 +66,8 @@ MAX_IMAGE_POINTS = 6_000  # largest tested network; of a larger one, the points 
 # alternatives share them, and only the best is adjusted to the end: 46 of 186 photographs, half a minute.
 MAX_WORK = 3e8
 MAX_PHOTOGRAPHS = 300  # largest network that is tested as a whole, as its normal equations are dense
-PART_PHOTOGRAPHS = 100  # of the parts of a larger one: each takes 1 to 5 s
+PART_PHOTOGRAPHS = 60  # of the parts of a larger one
+PART_IMAGE_POINTS = 2_000  # of a part: with more, the parts of 1,000 photographs take a minute
 WITHOUT = "the other photographs"  # with which those of a part do not shift
 MIN_SHAPE = 4  # given points with a shape that the datum does not determine
 OF_FREE_POINTS = (  # tests that do not apply to given points
@@ -155,7 +156,9 @@ def _judge_parts(final: Adjustment, unit: str) -> JudgedAssumptions:
     reduced = reduced_to(network, final.estimate, used, parts)
     for images, (part, start, rows) in zip(parts, reported("parts tested", reduced, len(parts)), strict=True):
         factor, alarm = final.image_sigma_factor[rows], final.false_alarm / len(parts)
-        plain = adjust_image_points(part, start, final.rejected[rows], factor, false_alarm=alarm)
+        plain = adjust_image_points(
+            part, start, final.rejected[rows], factor, false_alarm=alarm, most=PART_IMAGE_POINTS
+        )
         if plain is None:
             continue
         if final.error_correlation is not None:
@@ -503,6 +506,7 @@ def adjust_image_points(
     *,
     datum: Literal["free", "control"] = "free",
     false_alarm: float,
+    most: int | None = None,
 ) -> Adjustment | None:
     """Adjust the image points of a network alone, or a sample of many; None if they determine no solution.
 
@@ -513,11 +517,12 @@ def adjust_image_points(
         factor: factor on the standard deviations of image points, (k,).
         datum: "control" to adjust them with the given points.
         false_alarm: probability that right image points are called wrong.
+        most: image points of the sample; MAX_IMAGE_POINTS if None.
     """
     alone = without_given(network)
     if datum == "control":
         alone = alone.with_given(network.control)
-    part, start, rows = _sample(alone, estimate)
+    part, start, rows = _sample(alone, estimate, MAX_IMAGE_POINTS if most is None else most)
     try:
         free = adjust(
             part,
@@ -543,19 +548,19 @@ def best_explanation(plain: Adjustment) -> Cause | None:
         return None
 
 
-def _sample(network: Network, values: Estimate) -> tuple[Network, Estimate, BoolArray]:
-    """Return a network of about MAX_IMAGE_POINTS image points, its estimate, and which these are.
+def _sample(network: Network, values: Estimate, most: int) -> tuple[Network, Estimate, BoolArray]:
+    """Return a network of at most about so many image points, its estimate, and which these are.
 
     Points with many rays are preferred, and each photograph gets its share.
     """
     seen, m = network.image_points, len(network.images)
     points = np.ones(len(network.points), dtype=bool)
-    if len(seen) > MAX_IMAGE_POINTS:
+    if len(seen) > most:
         points[:] = False
         images = [seen.image[rows] for rows in rows_of(seen.point, len(points))]
         count = np.zeros(m, dtype=np.int64)
         for j in np.argsort([-len(of_point) for of_point in images], kind="stable"):
-            if (count[images[j]] < MAX_IMAGE_POINTS / m).any():
+            if (count[images[j]] < most / m).any():
                 points[j] = True
                 np.add.at(count, images[j], 1)
     rows = points[seen.point]
