@@ -42,12 +42,12 @@ def parts_of(network: Network, used: BoolArray, most: int) -> list[BoolArray]:
     moment = np.unique(moment, return_inverse=True)[1]
     shape = int(moment.max()) + 1, len(network.points)
     shows = csr_matrix((np.ones(len(seen), np.float32), (moment[seen.image], seen.point)), shape)
-    together = csr_matrix(shows @ shows.T)
+    common = csr_matrix(shows @ shows.T)
     photographs = np.bincount(moment).astype(float)
     parts, left = [], [np.arange(len(photographs))]
     while left:
         nodes = left.pop()
-        graph = together[nodes][:, nodes]
+        graph = common[nodes][:, nodes]
         count, component = connected_components(graph, directed=False)
         if count > 1:
             left += [nodes[component == c] for c in range(count)]

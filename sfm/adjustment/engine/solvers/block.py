@@ -248,38 +248,3 @@ def squares(block: Block, state: State, weight: FloatArray) -> float:
     """Return v'Pv of the image points of a block; infinite if a point is behind a camera."""
     observations = block.layout.observations
     return sum_of_squares(observations, state, repeated(weight, len(observations.point)))
-
-
-def point_step(equations: Equations, x: FloatArray) -> FloatArray:
-    """Return `Equations.point_step` of a block."""
-    return equations.point_step(x)
-
-
-def times_schur(equations: Equations, x: FloatArray) -> FloatArray:
-    """Return `Equations.times_schur` of a block."""
-    return equations.times_schur(x)
-
-
-def times_reduced(equations: Equations, x: FloatArray) -> FloatArray:
-    """Return `Equations.times_reduced` of a block."""
-    return equations.times_reduced(x)
-
-
-def times_points(equations: Equations, h: FloatArray) -> FloatArray:
-    """Return `Equations.times_points` of a block."""
-    return equations.times_points(h)
-
-
-def through(equations: Equations, points: IntArray) -> FloatArray:
-    """Return `Equations.through` of some object points of a block."""
-    return equations.through(points)
-
-
-def normals_of(equations: Equations, points: IntArray) -> FloatArray:
-    """Return `Equations.normals_of` of some object points of a block."""
-    return equations.normals_of(points)
-
-
-def lower_of(equations: Equations) -> FloatArray:
-    """Return the Cholesky factors of the object points of a block."""
-    return equations.lower

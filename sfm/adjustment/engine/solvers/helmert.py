@@ -25,6 +25,7 @@ from __future__ import annotations
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass, field, replace
 from functools import cached_property
+from operator import attrgetter
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -34,6 +35,7 @@ from scipy.sparse import csr_matrix
 
 from sfm.adjustment.datum import Motions
 from sfm.adjustment.engine.collinearity import State
+from sfm.adjustment.engine.normals import Equations
 from sfm.adjustment.engine.observed import ObservedKind, terms_of, vPv_of
 from sfm.adjustment.engine.solvers import block as of_block
 from sfm.adjustment.engine.solvers import protocol
@@ -259,7 +261,7 @@ class HelmertEquations:
     def lower(self) -> FloatArray:
         """Cholesky factors of V; unit matrix for kept points, (n, 3, 3)."""
         L = np.empty((len(self.held), 3, 3))
-        for piece, of_points in zip(self.solver.pieces, self._each(of_block.lower_of), strict=True):
+        for piece, of_points in zip(self.solver.pieces, self._each(attrgetter("lower")), strict=True):
             L[piece.points] = of_points
         return L
 
@@ -275,7 +277,7 @@ class HelmertEquations:
         """Return V of some object points before elimination, (p, 3, 3)."""
         places = self._places(points)
         V = np.zeros((len(points), 3, 3))
-        parts = self._each(of_block.normals_of, [own for own, _ in places])
+        parts = self._each(Equations.normals_of, [own for own, _ in places])
         for (_, at), part in zip(places, parts, strict=True):
             V[at] += part  # kept points have image points in several blocks
         return V
@@ -283,7 +285,7 @@ class HelmertEquations:
     def point_step(self, reduced_step: FloatArray) -> FloatArray:
         """Return the step of all object points that belongs to a step of the reduced unknowns, (n, 3)."""
         dX = np.empty((len(self.held), 3))
-        steps = self._each(of_block.point_step, self._rows(reduced_step))
+        steps = self._each(Equations.point_step, self._rows(reduced_step))
         for piece, of_points in zip(self.solver.pieces, steps, strict=True):
             dX[piece.points] = of_points
         return dX
@@ -291,7 +293,7 @@ class HelmertEquations:
     def times_schur(self, x: FloatArray) -> FloatArray:
         """Return S x with the undamped reduced normal matrix S, without forming S, (reduced, e)."""
         product, first = np.zeros_like(x), self.solver.layout.pose_free.size
-        parts = self._each(of_block.times_schur, self._rows(x))
+        parts = self._each(Equations.times_schur, self._rows(x))
         for piece, part in zip(self.solver.pieces, parts, strict=True):
             product[piece.columns] += part
         if self.given is not None:
@@ -308,7 +310,7 @@ class HelmertEquations:
     def times_reduced(self, x: FloatArray) -> FloatArray:
         """Return Y'x of vectors of the reduced unknowns (reduced, e), (n, 3, e)."""
         out = np.empty((len(self.held), 3, x.shape[1]))
-        parts = self._each(of_block.times_reduced, self._rows(x))
+        parts = self._each(Equations.times_reduced, self._rows(x))
         for piece, part in zip(self.solver.pieces, parts, strict=True):
             out[piece.points] = part  # 0 for kept points
         return out
@@ -316,7 +318,7 @@ class HelmertEquations:
     def times_points(self, h: FloatArray) -> FloatArray:
         """Return Y h of vectors of the object points (n, 3, e), (reduced, e)."""
         out = np.zeros((self.solver.layout.reduced, h.shape[2]))
-        parts = self._each(of_block.times_points, [h[piece.points] for piece in self.solver.pieces])
+        parts = self._each(Equations.times_points, [h[piece.points] for piece in self.solver.pieces])
         for piece, part in zip(self.solver.pieces, parts, strict=True):
             out[piece.columns] += part
         return out
@@ -325,7 +327,7 @@ class HelmertEquations:
         """Return Y L^-1, the effect of the reduced unknowns on some object points, (reduced, 3 p)."""
         through = np.zeros((self.solver.layout.reduced, 3 * len(points)))
         places = self._places(points)
-        parts = self._each(of_block.through, [own for own, _ in places])
+        parts = self._each(Equations.through, [own for own, _ in places])
         for piece, (_, at), part in zip(self.solver.pieces, places, parts, strict=True):
             through[np.ix_(piece.columns, (3 * at[:, None] + np.arange(3)).ravel())] += part
         return through
