@@ -11,9 +11,10 @@ import csv
 import math
 import sys
 from array import array
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from itertools import compress
+from operator import itemgetter
 from pathlib import Path
 from typing import TextIO
 
@@ -241,8 +242,7 @@ def array_table(
         raise SurveyFileError(f"{what}: no rows, at least one is needed")
     word, places = ("row", range(1, rows + 1)) if line is None else ("line", line)
     names = tuple(
-        tuple(_name(str(cell), f"{what}, {word} {k}: {name}") for k, cell in zip(places, column, strict=True))
-        for name, column in texts.items()
+        _names(name, list(map(str, column)), f"{what}, {word}", places) for name, column in texts.items()
     )
     values = np.column_stack(list(numbers.values()))
     table = CsvTable(Path(what), tuple(texts), names, values, np.array(places), word, tuple(numbers))
@@ -362,6 +362,14 @@ def _opened(path: Path) -> TextIO:
     except (OSError, ValueError) as error:
         reason = error.strerror if isinstance(error, OSError) else error
         raise SurveyFileError(f"{path}: the table cannot be read: {reason}") from error
+
+
+def _names(column: str, cells: list[str], where: str, places: Iterable[int]) -> tuple[str, ...]:
+    """Return the names in the cells of a column, each checked once, where it is first."""
+    first = dict(zip(reversed(cells), reversed(list(places)), strict=True))
+    in_order = sorted(first.items(), key=itemgetter(1))
+    names = {cell: _name(cell, f"{where} {place}: {column}") for cell, place in in_order}
+    return tuple(map(names.__getitem__, cells))
 
 
 def _name(cell: str, where: str) -> str:

@@ -14,6 +14,7 @@ from sfm.files.plain_text import as_plain
 from sfm.model.errors import SurveyFileError
 
 MAX_ENTRIES = 500_000  # files and folders that are examined
+NUMBERED_MODELS = "sparse"  # folder of COLMAP's models 0, 1, ...
 BELOW = "**"  # a folder and everything below it
 _BRACKETED = re.compile(r"\[([*?[])\]")  # a wildcard that stands for itself
 COMPANION = "._"  # begins the name of a file of macOS on other disks, which has the name of another after it
@@ -34,6 +35,18 @@ def nearest_name(path: Path) -> str:
         return ""
     like = get_close_matches(path.name, names, 1)
     return f", did you mean {as_plain(str(path.with_name(like[0])))}?" if like else ""
+
+
+def name_of_model(path: Path) -> str:
+    """Return what to call a model after its file or folder, and the one above a number or `sparse`.
+
+    COLMAP numbers the models of a project, so that each project has one that is called 0.
+    """
+    parts = path.resolve().parts  # of "." too
+    at = len(parts) - 1
+    while at > 1 and (parts[at].isdigit() or parts[at] == NUMBERED_MODELS):
+        at -= 1
+    return "/".join(parts[at:])
 
 
 def find_files(

@@ -32,6 +32,7 @@ from pydantic import (
     StringConstraints,
     ValidationError,
 )
+from pydantic_core import to_json
 
 from sfm.model.conventions import AnyArray
 from sfm.model.errors import SurveyFileError
@@ -169,19 +170,18 @@ def as_plain(text: str) -> str:
 
 def _column(values: Sequence[object] | AnyArray) -> list[str]:
     """Return the cells of a column."""
-    if isinstance(values, np.ndarray):
-        if values.dtype.kind == "f" and np.isfinite(values).all():
-            return list(map(repr, values.tolist()))
-        values = values.tolist()
+    values = values.tolist() if isinstance(values, np.ndarray) else values
     kinds = set(map(type, values))
     if kinds == {float}:
         numbers = cast(Sequence[float], values)
-        if all(map(math.isfinite, numbers)):
-            return list(map(repr, numbers))
-        return [repr(value) if value - value == 0 else "" for value in numbers]  # neither NaN nor infinite
+        cells = str(to_json(numbers, inf_nan_mode="null"), "ascii")[1:-1].split(",")
+        return ["" if cell == "null" else cell for cell in cells] if "null" in cells else cells
+    if kinds == {int}:
+        return list(map(str, values))
     if kinds == {str}:
         texts = cast(Sequence[str], values)
-        return [text if is_word(text) else _text_cell(text) for text in texts]
+        cell_of = {text: text if is_word(text) else _text_cell(text) for text in set(texts)}
+        return list(map(cell_of.__getitem__, texts))
     return [_cell(value) for value in values]
 
 

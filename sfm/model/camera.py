@@ -399,9 +399,15 @@ def within_reach(camera: Camera, xy_px: FloatArray, seen_px: FloatArray) -> Bool
         Which pixels have a ray less than 90 degrees from the axis, or no farther from it than that of an
         image point, (k,).
     """
-    rays, measured = (rays_from_pixel(camera, places) for places in (xy_px, seen_px))
-    rays, measured = (part / np.linalg.norm(part, axis=1)[:, None] for part in (rays, measured))
-    return np.asarray(rays[:, 2] <= max(0.0, np.nanmax(measured[:, 2], initial=0.0)))
+
+    def towards_back(places: FloatArray) -> FloatArray:
+        rays = rays_from_pixel(camera, places)
+        return np.asarray(rays[:, 2] / np.linalg.norm(rays, axis=1))
+
+    backwards = towards_back(xy_px)
+    if not (backwards > 0).any():
+        return backwards <= 0
+    return np.asarray(backwards <= max(0.0, np.nanmax(towards_back(seen_px), initial=0.0)))
 
 
 def outermost_reached(camera: Camera, ends_px: FloatArray, seen_px: FloatArray) -> FloatArray:

@@ -7,7 +7,7 @@ from collections.abc import Sequence
 import cv2
 import numpy as np
 
-from sfm.model.camera import Camera, project, rays_from_pixel, tangents_from_pixel
+from sfm.model.camera import Camera, pixel_from_rays, rays_from_pixel, tangents_from_pixel
 from sfm.model.conventions import BoolArray, FloatArray, IntArray, skew
 from sfm.model.estimate import Estimate
 from sfm.model.network import ImagePoints, Network, rows_of
@@ -100,10 +100,12 @@ def image_residuals(network: Network, estimate: Estimate) -> FloatArray:
     """
     seen = network.image_points
     computed = np.full((len(seen), 2), np.nan)
-    for i, rows in enumerate(rows_of(seen.image, len(network.images))):
-        if len(rows) and estimate.oriented[i]:
-            camera, points = estimate.cameras[network.camera[i]], estimate.points[seen.point[rows]]
-            computed[rows] = project(camera, estimate.position[i], estimate.rotation[i], points)
+    away = estimate.points[seen.point] - estimate.position[seen.image]
+    rays = np.einsum("ka,kab->kb", away, estimate.rotation[seen.image])
+    of_camera = rows_of(network.camera[seen.image], len(estimate.cameras))
+    for camera, rows in zip(estimate.cameras, of_camera, strict=True):
+        computed[rows] = pixel_from_rays(camera, rays[rows])
+    computed[~estimate.oriented[seen.image]] = np.nan
     return computed - seen.xy
 
 

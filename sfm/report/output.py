@@ -38,7 +38,6 @@ from sfm.files.open_folders import disk_errors, make_folder, open_regular_file, 
 from sfm.files.plain_text import Content, Name, or_none, read_json
 from sfm.files.whole_files import whole_folder
 from sfm.judgement.calibrated_cameras import projection_of
-from sfm.judgement.checks import root_mean_square
 from sfm.judgement.survey_result import StageTime, SurveyResult
 from sfm.model.conventions import AnyArray
 from sfm.model.display import counted, listed
@@ -207,9 +206,11 @@ def plot_data(findings: Findings) -> PlotData:
     adjustment, interior, geometry = findings.result.adjustment, findings.interior, findings.geometry
     network, estimate, used = adjustment.network, adjustment.estimate, ~adjustment.rejected
     seen = network.image_points.select(used)
-    sigma = np.array(
-        [root_mean_square(of_point) for of_point in adjusted_sigmas(adjustment.covariance.points)]
-    )
+    of_points = adjusted_sigmas(adjustment.covariance.points)
+    known = np.isfinite(of_points)
+    squares = np.where(known, of_points, 0.0) ** 2
+    with np.errstate(invalid="ignore"):
+        sigma = np.sqrt(squares.sum(axis=1) / known.sum(axis=1))  # NaN where none is known
     factor, unit = finer_unit(findings.result.length_unit, float(findings.precision.largest[3]))
     # Baarda (1968): sigma of v = sigma0 * sigma * sqrt(r) with the redundancy number r
     variance = np.einsum("kii->ki", adjustment.image_covariance[used])

@@ -114,18 +114,20 @@ def _groups(
     others: tuple[str, ...],
 ) -> list[tuple[Any, ...]]:
     """Return kind, name, accepted, rejected, RMS and largest |v| in x and y, px, and who sees the largest."""
-    order = np.argsort(index, kind="stable")
-    bounds = np.searchsorted(index[order], np.arange(1, len(names)))
-    out = []
-    for name, rows in zip(names, np.split(order, bounds), strict=True):
-        kept = rows[~a.rejected[rows]]
-        v = np.abs(a.residuals[kept])
-        rms, largest, at = np.full(2, np.nan), np.full(2, np.nan), ["", ""]
-        if len(kept):
-            rms, largest = np.sqrt((v**2).mean(axis=0)), v.max(axis=0)
-            at = [others[other[k]] for k in kept[v.argmax(axis=0)]]
-        out.append((kind, name, len(kept), len(rows) - len(kept), *rms, *largest, *at))
-    return out
+    n, kept = len(names), np.flatnonzero(~a.rejected)
+    every, accepted = (np.bincount(of, minlength=n) for of in (index, index[kept]))
+    rms, largest = np.full((2, 2, n), np.nan)
+    worst = np.full((2, n), "", dtype=object)
+    seen = np.flatnonzero(accepted)
+    for axis, v in enumerate(np.abs(a.residuals[kept]).T):
+        rms[axis, seen] = np.sqrt(np.bincount(index[kept], v**2, minlength=n)[seen] / accepted[seen])
+        order = np.lexsort((-v, index[kept]))
+        first = kept[order[np.cumsum(accepted[seen]) - accepted[seen]]]  # the largest of each group
+        largest[axis, seen] = np.abs(a.residuals[first, axis])
+        worst[axis, seen] = [others[j] for j in other[first]]
+    columns = (accepted, every - accepted, *rms, *largest)
+    rows = zip(names, *(column.tolist() for column in columns), *worst.tolist(), strict=True)
+    return [(kind, *row) for row in rows]
 
 
 def _limits(result: SurveyResult) -> str:

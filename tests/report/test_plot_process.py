@@ -13,6 +13,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.font_manager import findfont
 from matplotlib.ft2font import FT2Font
 
@@ -20,6 +21,7 @@ import sfm.report.figures.plot_process as drawing
 from sfm.adjustment.datum import Datum
 from sfm.adjustment.solve import adjust
 from sfm.judgement.survey_result import SurveyResult
+from sfm.model.conventions import IntArray
 from sfm.report.figures import plots
 from sfm.report.figures.plot_data import PlotData
 from sfm.report.figures.plot_process import PlotProcess, draw_plots, plot_process
@@ -61,6 +63,25 @@ def test_powers_of_ten_in_units_are_drawn_and_missing_characters_are_not() -> No
     unit = "× 10⁻⁶ network units, 10⁻¹²³⁴⁵⁷⁸⁹⁰"
     assert plots._plain(unit) == unit and {ord(c) for c in unit} <= set(glyphs)
     assert plots._plain("面 $x$") == r"? \$x\$"
+
+
+def test_points_that_others_cover_are_not_drawn(shown: PlotData, monkeypatch: pytest.MonkeyPatch) -> None:
+    rng = seed_of("covered points")
+    crowd = replace(shown, points=rng.uniform(-1, 1, (60_000, 3)), sigma=rng.lognormal(size=60_000))
+    places = crowd.points[:, :2]
+    kept = plots._uncovered(places)
+    assert len(np.unique(kept)) == len(kept) < 40_000 and (np.diff(kept) > 0).all()
+    assert len(plots._uncovered(places[:300])) > 295 and len(plots._uncovered(places[:0])) == 0
+
+    def picture() -> IntArray:
+        canvas = FigureCanvasAgg(plots.precision_figure(crowd))
+        canvas.draw()
+        return np.asarray(canvas.buffer_rgba())[:, :, :3].astype(int)
+
+    few = picture()
+    monkeypatch.setattr(plots, "_uncovered", lambda xy: np.arange(len(xy)))
+    change = np.abs(few - picture()).max(axis=2)
+    assert (change > 40).mean() < 0.01 < (few.min(axis=2) < 250).mean()
 
 
 def test_plots_are_drawn_elsewhere_and_the_same(

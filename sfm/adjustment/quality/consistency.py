@@ -28,7 +28,7 @@ from sfm.adjustment.result import Adjustment, computed_once
 from sfm.model.camera import project, ray_jacobian
 from sfm.model.conventions import BoolArray, FloatArray, IntArray
 from sfm.model.distributions import chi2_isf, chi2_sf, f_sf, level_of_single, normal_ppf, t_ppf
-from sfm.model.network import rows_of
+from sfm.model.network import rows_of, sum_rows
 from sfm.model.remarks.row import EXPECTED_SIGMAS
 
 # Ratio r of the largest component of a photograph to the median, or of the differences between two parts to
@@ -86,8 +86,8 @@ def consistency_of(adjustment: Adjustment) -> Consistency:
         return Consistency((), None)
     parts = point_normals(adjustment)
     rays = parts.rows_of_points(adjustment)
-    of_point = zip(adjustment.network.points, adjustment.covariance.points, strict=True)
-    fixed = {name for name, covariance in of_point if not covariance.any()}
+    exact = ~adjustment.covariance.points.any(axis=(1, 2))
+    fixed = {adjustment.network.points[j] for j in np.flatnonzero(exact)}
     doubtful = tuple(
         doubtful_point
         for doubtful_point in doubtful_points(adjustment, parts, rays)
@@ -147,19 +147,22 @@ def _change(adjustment: Adjustment, parts: PointNormals, level: float) -> tuple[
     ends = np.unique(np.linspace(MIN_PART - 1, m - MIN_PART - 1, MAX_DIVISIONS).round().astype(int))
     best, least = None, level / len(ends)
     for end in ends.tolist():
-        (first, Q1, rays1), (second, Q2, rays2) = (
-            parts.intersections(rows[part], point[part], n) for part in (image <= end, image > end)
+        halves = [(rows[part], point[part]) for part in (image <= end, image > end)]
+        known = np.minimum(*(np.bincount(of_point, minlength=n) for _, of_point in halves)) >= MIN_PART
+        place = np.cumsum(known) - 1
+        (first, Q1), (second, Q2) = (
+            parts.intersections(of[known[of_point]], place[of_point[known[of_point]]], int(known.sum()))
+            for of, of_point in halves
         )
-        known = np.minimum(rays1, rays2) >= MIN_PART
-        d, freedom = (second - first)[known], 3 * int(known.sum())
-        weighted = np.einsum("nij,nj->ni", np.linalg.pinv((Q1 + Q2)[known], hermitian=True), d)
+        d, freedom = second - first, 3 * len(first)
+        weighted = np.einsum("nij,nj->ni", np.linalg.pinv(Q1 + Q2, hermitian=True), d)
         square = float((d * weighted).sum())
         if not 0 < freedom < redundancy:
             continue
         F = square / freedom / max((total - square) / (redundancy - freedom), np.finfo(float).tiny)
         probability = float(f_sf(F, freedom, redundancy - freedom))
         if probability < least and F > MIN_UNEVEN_RATIO**2:
-            from_first = np.einsum("nij,nj->ni", Q1[known], weighted)  # to the weighted mean of both parts
+            from_first = np.einsum("nij,nj->ni", Q1, weighted)  # to the weighted mean of both parts
             scale = np.where(sigma[known] > 0, sigma[known], np.inf)
             nearest = min(float((np.abs(away) / scale).max()) for away in (from_first, d - from_first))
             names = a.network.images[end], a.network.images[end + 1]
@@ -291,23 +294,17 @@ class PointNormals:
         fitted = np.einsum("gi,gij,gj->g", b, np.linalg.pinv(N, hermitian=True), b)
         return np.asarray(weights @ self.q[rows] - fitted)
 
-    def intersections(
-        self, rows: IntArray, point: IntArray, count: int
-    ) -> tuple[FloatArray, FloatArray, IntArray]:
-        """Return shifts (n, 3), cofactors (n, 3, 3) and rays (n,) of points from these image points alone.
+    def intersections(self, rows: IntArray, point: IntArray, count: int) -> tuple[FloatArray, FloatArray]:
+        """Return shifts (n, 3) and cofactors (n, 3, 3) of points from these image points alone.
 
         Args:
             rows: image points.
             point: object point of each of them.
             count: number of object points, n.
         """
-        N, b = np.zeros((count, 3, 3)), np.zeros((count, 3))
-        np.add.at(N, point, self.N[rows])
-        np.add.at(b, point, self.b[rows])
+        N, b = (sum_rows(point, of[rows], count) for of in (self.N, self.b))
         Q: FloatArray = np.asarray(np.linalg.pinv(N, hermitian=True), dtype=float)
-        shift: FloatArray = -np.einsum("nij,nj->ni", Q, b)
-        rays: IntArray = np.bincount(point, minlength=count)
-        return shift, Q, rays
+        return -np.einsum("nij,nj->ni", Q, b), Q
 
     def step(self, rows: IntArray) -> FloatArray:
         """Return the shift of the point when fitted to these image points alone, (3,)."""

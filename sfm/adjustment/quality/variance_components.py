@@ -64,9 +64,11 @@ def _components(
     used = ~adjustment.rejected
     v = adjustment.residuals[used]
     P = np.linalg.inv(covariance[used])
-    vPv, redundancy = np.zeros(g), np.zeros(g)
-    np.add.at(vPv, group[used], adjustment.weights[used] * np.einsum("ka,kab,kb->k", v, P, v))
-    np.add.at(redundancy, group[used], adjustment.redundancy_numbers[used].sum(axis=1))
+    squares = adjustment.weights[used] * (v * np.einsum("kab,kb->ka", P, v)).sum(axis=1)
+    r = adjustment.redundancy_numbers[used].sum(axis=1)
+    vPv, redundancy = (
+        np.asarray(np.bincount(group[used], of, minlength=g), dtype=float) for of in (squares, r)
+    )
     sigma0 = adjustment.inflation * _root_ratio(vPv, redundancy, few)
     return VarianceComponents(names, sigma0, redundancy, 2 * np.bincount(group[used], minlength=g))
 

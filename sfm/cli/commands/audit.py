@@ -62,6 +62,7 @@ def audit(
         from adapters.formats.content import ALL, losses
         from adapters.formats.registry import read_content
         from sfm.cli.console import exit_by, print_page, print_verdict
+        from sfm.files.globs import name_of_model
         from sfm.files.open_folders import refuse_foreign_folder
         from sfm.model.display import listed
         from sfm.pipeline import run_survey
@@ -84,7 +85,7 @@ def audit(
 
     with working_on(str(model)):
         content = read_content(model, from_format)
-        stated_model = replace(content.result, name=model.resolve().name)  # of "." too
+        stated_model = replace(content.result, name=name_of_model(model))
         stated_model, added = prepared_model(stated_model, one_camera=one_camera)
         stated = stated_of(stated_model)
         given = None if survey is None else read_survey(survey)

@@ -92,6 +92,7 @@ def refine(
             update_model,
         )
         from sfm.cli.console import print_page
+        from sfm.files.globs import name_of_model
         from sfm.files.whole_files import refuse_unwritable, whole_folder
         from sfm.products.refining.joined_cameras import join_cameras
         from sfm.products.refining.oriented_windows import measure_model_targets
@@ -151,7 +152,7 @@ def refine(
     of_files = key_points_of(opened) if written else (0, math.nan)
     numbers = Numbers(opened.image_ids, opened.point_ids, interior, *of_files)
     print(refinement_text(refinement), end="")
-    page = page_of(refinement, numbers=numbers, title=model.resolve().name)
+    page = page_of(refinement, numbers=numbers, title=name_of_model(model))
     with whole_folder(out) as folder:
         if written:
             write_scene(folder, opened.scene)

@@ -15,6 +15,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 from dataclasses import dataclass, replace
+from functools import cached_property
 
 import numpy as np
 from scipy.special import gammaln
@@ -385,6 +386,16 @@ class _Moves:
     squares: FloatArray  # normal equations before the elimination, (n, 3, 3)
     blocks: FloatArray  # those of each point alone, with all unknowns eliminated, (n, 3, 3)
 
+    @property
+    def squares_of_columns(self) -> FloatArray:
+        """Squares of the columns of each motion, (n, 3)."""
+        return np.diagonal(self.squares, axis1=1, axis2=2)
+
+    @cached_property
+    def single(self) -> FloatArray:
+        """Gain of the motion of each point alone, (n,)."""
+        return gains_of(self.blocks, self.g, self.squares_of_columns)[0]
+
     def log_sets(self, count: int) -> float:
         """Return ln of the number of sets of so many points."""
         return float(
@@ -412,9 +423,7 @@ def _moves(reduced: Reduced, factor: FloatArray) -> _Moves:
 
 def _each_by_itself(reduced: Reduced, moves: _Moves) -> Iterator[Alternative]:
     """Yield the best set of points that moved by different vectors, in the order of their single gains."""
-    squares = np.einsum("nii->ni", moves.squares)
-    single, _ = gains_of(moves.blocks, moves.g, squares)
-    order = np.argsort(-single)
+    squares, order = moves.squares_of_columns, np.argsort(-moves.single)
     tried = order[: min(MAX_MOVED, max(len(order) // 2, 1))]
     flat = moves.K[tried].reshape(-1, len(reduced.t))
     H = -flat @ reduced.Sinv @ flat.T
@@ -423,7 +432,7 @@ def _each_by_itself(reduced: Reduced, moves: _Moves) -> Iterator[Alternative]:
         H[block, block] += moves.alone[j]
     best: Alternative | None = None
     for count in range(1, len(tried) + 1):
-        part, others = slice(0, 3 * count), single[order[count:]]
+        part, others = slice(0, 3 * count), moves.single[order[count:]]
         gain = gain_of(H[part, part], moves.g[tried].ravel()[part], squares[tried].ravel()[part])
         spread = Spread(float(others.mean()) / 3, 3 * len(others)) if len(others) else NONE
         search, points = moves.log_sets(count), moves.points[tried[:count]]
@@ -441,34 +450,39 @@ def _as_one_body(reduced: Reduced, moves: _Moves) -> Iterator[Alternative]:
 
     The motion is then that of the set, in turn with the set, until it stays the same.
     """
-    X, squares = reduced.adjustment.estimate.points[moves.points], np.einsum("nii->ni", moves.squares)
-    single, _ = gains_of(moves.blocks, moves.g, squares)
-    for first in np.argsort(-single)[:STARTS]:
+    X, K_flat = reduced.adjustment.estimate.points[moves.points], moves.K.reshape(-1, len(reduced.t))
+    earlier: set[bytes] = set()  # sets of earlier starts; from the same set, all that follows is the same
+    for first in np.argsort(-moves.single)[:STARTS]:
+        own: set[bytes] = set()
         d = -np.linalg.lstsq(moves.blocks[first], moves.g[first], rcond=None)[0]
         again = d @ moves.blocks @ d + 2 * moves.g @ d < 0
         for _ in range(ROUNDS):
             # if most points moved, the others moved in the opposite direction, which is equivalent
             members = ~again if 2 * again.sum() > len(again) else again
-            if members.sum() < MIN_OF_BODY:
+            if members.sum() < MIN_OF_BODY or members.tobytes() in earlier:
                 break
+            own.add(members.tobytes())
             motions = rigid_motions(X, members)
-            M = motions[members]
-            Mt = np.swapaxes(M, 1, 2)
-            K = (Mt @ moves.K[members]).sum(axis=0)
-            H = (Mt @ moves.alone[members] @ M).sum(axis=0) - K @ reduced.Sinv @ K.T
-            g = np.einsum("nij,nj->i", Mt, moves.g[members])
-            gain = gain_of(H, g, np.einsum("nii->i", Mt @ moves.squares[members] @ M))
+            M = np.where(members[:, None, None], motions, 0.0)  # (n, 3, 6)
+            flat = M.reshape(-1, 6)
+            K = flat.T @ K_flat
+            H = flat.T @ (moves.alone @ M).reshape(-1, 6) - K @ reduced.Sinv @ K.T
+            gain = gain_of(H, flat.T @ moves.g.ravel(), (M * (moves.squares @ M)).sum(axis=(0, 1)))
             move = motions @ gain.beta
-            left = moves.g - moves.K @ (reduced.Sinv @ (K.T @ gain.beta))
-            left[members] += np.einsum("nij,nj->ni", moves.alone[members], move[members])
-            loss = np.einsum("na,nab,nb->n", move, moves.blocks, move)  # of v'Pv, by a point that changes
+            moved = np.where(members[:, None], move, 0.0)
+            left = moves.g - (K_flat @ (reduced.Sinv @ (K.T @ gain.beta))).reshape(-1, 3)
+            left += np.einsum("nij,nj->ni", moves.alone, moved)
+            # of v'Pv, by a point that changes
+            loss = (move * np.einsum("nij,nj->ni", moves.blocks, move)).sum(axis=1)
             along = 2 * (left * move).sum(axis=1)
             again = np.where(members, loss > along, loss + along < 0)
             if (again == members).all():
                 break
-        if members.sum() < MIN_OF_BODY:
+        known = members.tobytes() in earlier
+        earlier |= own
+        if known or members.sum() < MIN_OF_BODY:
             continue
-        values, ranks = gains_of(moves.blocks, left, squares)
+        values, ranks = gains_of(moves.blocks, left, moves.squares_of_columns)
         redundancy = int(ranks.sum()) - gain.rank
         spread = Spread(float(values.sum()) / redundancy, redundancy)
         search, points = moves.log_sets(int(members.sum())), moves.points[members]

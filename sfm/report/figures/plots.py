@@ -14,7 +14,7 @@ from matplotlib.colors import ListedColormap, LogNorm
 from matplotlib.figure import Figure
 from PIL import Image
 
-from sfm.model.conventions import SUPERSCRIPTS, AnyArray, FloatArray
+from sfm.model.conventions import SUPERSCRIPTS, AnyArray, FloatArray, IntArray
 from sfm.report.figures.plot_data import Plot, PlotData
 
 BLUE, RED, GREY, GREEN, ORANGE = "#1f5fa8", "#c8372d", "#8a8f98", "#2b7a4b", "#d98a1f"
@@ -29,6 +29,7 @@ LETTER_IN = 0.065  # width of a letter in the names of photographs
 SHADES = ListedColormap(colormaps["viridis"](np.linspace(0.8, 0.0, 256)))
 CAMERA_COLOURS = (BLUE, ORANGE, GREEN, "#7a4fa3", "#b0567a")
 MAX_NAMED = 60  # photographs whose names are legible
+PLACES = 200  # across a picture of points; a third of a dot each
 MAX_ARROWS = 4000  # more residual vectors than this only blacken the picture
 LEVELS = 11  # contours of the projection uncertainty, in equal ratios
 OUTSIDE = 0.02  # part of the photograph below the lowest contour
@@ -243,12 +244,23 @@ def precision_figure(shown: PlotData) -> Figure:
     figure = two_panel_figure(4.6)
     for panel, title, (across, up) in zip(figure.subplots(1, 2), TITLES, ((0, 1), (0, 2)), strict=True):
         panel.plot(points[~known, across], points[~known, up], ".", color=GREY, markersize=3)
-        x, y = points[worst_last][:, [across, up]].T
-        drawn = panel.scatter(x, y, c=shown.sigma[worst_last], s=14, cmap=SHADES)
+        xy = points[worst_last][:, [across, up]]
+        seen = _uncovered(xy)
+        drawn = panel.scatter(*xy[seen].T, c=shown.sigma[worst_last[seen]], s=14, cmap=SHADES)
         label = f"sigma [{_plain(shown.sigma_unit)}]"
         figure.colorbar(drawn, ax=panel, label=label, shrink=0.85, fraction=BAR_FRACTION)
         _show_object(panel, labels[across], labels[up], shown.unit, title)
     return figure
+
+
+def _uncovered(xy: FloatArray) -> IntArray:
+    """Return the points, (n, 2), that are drawn last at each of the places: they cover the others."""
+    if not len(xy):
+        return np.arange(0)
+    extent = max(float(np.ptp(xy, axis=0).max()), np.finfo(float).tiny)
+    column, row = ((xy - xy.min(axis=0)) / extent * PLACES).astype(int).T
+    _, last = np.unique((column * (PLACES + 1) + row)[::-1], return_index=True)
+    return np.sort(len(xy) - 1 - last)
 
 
 def projection_figure(shown: PlotData) -> Figure:

@@ -12,6 +12,7 @@ from adapters.colmap.adjuster import load_pycolmap
 from adapters.formats.content import Content
 from adapters.formats.registry import read_comparable, write_any, write_content
 from sfm.adjustment.quality.correlations import OrientationCorrelation
+from sfm.files.globs import name_of_model
 from sfm.model.camera import pixel_from_rays
 from sfm.model.conventions import FloatArray
 from sfm.model.errors import GeometryError
@@ -482,6 +483,13 @@ def test_the_command_writes_page_and_report(tmp_path: Path, capsys: pytest.Captu
     assert commands.kolinear("audit", tmp_path / "poses.json", "--out", tmp_path / "none") == 2
     assert "poses, cameras or points alone" in capsys.readouterr().err
     assert not (tmp_path / "none").exists()
+
+
+def test_models_that_programs_number_have_the_name_of_their_project(tmp_path: Path) -> None:
+    assert name_of_model(tmp_path / "bridge" / "sparse" / "0") == "bridge/sparse/0"
+    assert name_of_model(tmp_path / "bridge" / "12") == "bridge/12"
+    assert name_of_model(tmp_path / "bridge") == "bridge"
+    assert name_of_model(Path("/0")) == "0"
 
 
 def test_what_of_a_model_takes_no_part_is_said(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
