@@ -3,15 +3,16 @@
     python -m benchmarks.loops --photographs 60 250 500 --seeds 2
     python -m benchmarks.loops --photographs 500 --open
 
-Each photograph shows a piece of the wall and shares points with the next ones only, so that errors grow along
-the loop until it is closed. Nothing is given but the image points and a rough principal distance. With --open,
-the points between the last photographs and the first have other names in both, so that nothing closes the loop.
+Each photograph shows a piece of the wall and shares points with the next ones only, so that errors grow
+along the loop until it is closed. Nothing is given but the image points and a rough principal distance.
+With --open, the points between the last photographs and the first have other names in both, so that nothing
+closes the loop.
 
 Printed are the photographs that are oriented; the RMS error of their centres after a similarity onto the
-truth, and what the adjustment predicts in the same datum; the joint squared Mahalanobis distance of all centres
-and rotations per degree of freedom; the largest error of a centre in standard deviations; the error of the
-vector between the last centre and the first, and its largest coordinate in standard deviations; the processor
-time.
+truth, and what the adjustment predicts in the same datum; the joint squared Mahalanobis distance of all
+centres and rotations per degree of freedom; the largest error of a centre in standard deviations; the error
+of the vector between the last centre and the first, and its largest coordinate in standard deviations; the
+processor time.
 """
 
 from __future__ import annotations
