@@ -86,7 +86,8 @@ def run_survey_file(survey_file: Path, options: RunOptions) -> Path:
             refuse_other_origin,
             write_result,
         )
-        from sfm.runtime.forecast import Run, RunHistory, expected_seconds
+        from sfm.runtime.forecast import Run, RunHistory, announced, expected_seconds
+        from sfm.runtime.memory import peak_mb
         from sfm.runtime.progress_bar import drawn_progress
         from sfm.runtime.threads import cores, one_blas_thread
         from sfm.survey.inputs.calibration import Calibration, read_calibrations
@@ -154,7 +155,10 @@ def run_survey_file(survey_file: Path, options: RunOptions) -> Path:
         SurveyLog(watch=drawn) as log,
     ):
         history, work = RunHistory.of_user(), work_of(survey, files)
-        drawn.countdown.expected = expected_seconds(work, history.read())
+        runs = history.read()
+        if options.cluster is None and (sentence := announced(work, runs)):
+            print(sentence, file=sys.stderr)
+        drawn.countdown.expected = expected_seconds(work, runs)
         log.start(survey.name, survey_file, **origin.written(folder))
         with reporting_unfinished(folder, log, jobs=workers, pdf=options.pdf):
             result = run_survey(
@@ -185,7 +189,7 @@ def run_survey_file(survey_file: Path, options: RunOptions) -> Path:
             plot_process=plots,
         )
         if not revised and (store is None or not store.has_earlier):
-            history.add(Run(work, drawn.finished()))
+            history.add(Run(work, drawn.finished(), peak_mb()))
     seconds = time.perf_counter() - begun
     if options.product is not None:
         dependable = options.product.show(folder, pdf=options.pdf)

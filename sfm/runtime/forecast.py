@@ -1,4 +1,4 @@
-"""How long a survey takes: the stages of earlier runs, scaled to this one, and what of them is left.
+"""Time and memory of a survey: those of earlier runs, scaled to this one, and what is left of the time.
 
 The last runs of the user are kept. Where there are none that are alike, those of `TYPICAL` stand in, and the
 stages that are finished tell how much faster or slower this computer is.
@@ -15,7 +15,8 @@ from pathlib import Path
 
 from sfm.files.user_cache import make_user_folder, user_folder
 from sfm.files.whole_files import whole_file
-from sfm.model.errors import OutputError
+from sfm.model.errors import KolinearError, OutputError
+from sfm.runtime.memory import available_mb
 
 KEPT_RUNS = 200
 OTHERS_APART = math.log(8.0)  # a run of the user is preferred to a typical one eight times nearer in size
@@ -38,6 +39,12 @@ GROWTH = {
     "comparison": (1.2, 0.0, 0.6),
 }
 OTHER_GROWTH = (1.0, 0.0, 0.6)
+# Memory of the program itself, 10^6 bytes, and how that of a survey grows beyond it, as above: of 60 to 250
+# rendered photographs, and of 12,500 to 650,000 given image points.
+PROGRAM_MB = 400.0
+MEMORY_GROWTH = (0.5, 0.4, 1.0)
+MEMORY_MARGIN = 1.3  # expected memory over what there is, from which a survey is refused
+LONG_SECONDS = 60.0  # of a survey whose time and memory are said before it begins
 MEASURED = ("photographs", "targets", "tie points")  # stages that measure several photographs at a time
 
 
@@ -72,22 +79,30 @@ class Run:
 
     work: Work
     seconds: dict[str, float]
+    memory_mb: float = 0.0  # its peak, 10^6 bytes; 0 where it is not known
+
+    def memory_scaled_to(self, work: Work) -> float:
+        """Return the peak of the memory of another survey of these sources, 10^6 bytes."""
+        return PROGRAM_MB + max(self.memory_mb - PROGRAM_MB, 0.0) * self._grown(work, *MEMORY_GROWTH)
+
+    def _grown(self, work: Work, by_number: float, by_size: float, by_points: float) -> float:
+        """Return by what a need of this run grows to that of another, by its exponents."""
+        if work.image_points and self.work.image_points:
+            return float((work.image_points / self.work.image_points) ** by_points)
+        of_number = max(1, work.photographs) / max(1, self.work.photographs)
+        of_size = work.megapixels / self.work.megapixels if self.work.megapixels else 1.0
+        return float(of_number**by_number * of_size**by_size)
 
     def scaled_to(self, work: Work) -> dict[str, float]:
         """Return the time that each stage would take for another survey of these sources, s."""
-        of_number = max(1, work.photographs) / max(1, self.work.photographs)
-        of_size = work.megapixels / self.work.megapixels if self.work.megapixels else 1.0
-        of_points = work.image_points / self.work.image_points if self.work.image_points else 0.0
-        scaled = {}
-        for stage, seconds in self.seconds.items():
-            by_number, by_size, by_points = GROWTH.get(stage, OTHER_GROWTH)
-            of_stage = of_points**by_points if of_points else of_number**by_number * of_size**by_size
-            scaled[stage] = seconds * of_stage
-        return scaled
+        return {
+            stage: seconds * self._grown(work, *GROWTH.get(stage, OTHER_GROWTH))
+            for stage, seconds in self.seconds.items()
+        }
 
 
-def _typical(work: Work, stages: str, *seconds: float) -> Run:
-    return Run(work, dict(zip(stages.split(", "), seconds, strict=True)))
+def _typical(work: Work, stages: str, *seconds: float, memory_mb: float) -> Run:
+    return Run(work, dict(zip(stages.split(", "), seconds, strict=True)), memory_mb)
 
 
 _TARGETS = "targets, orientation, matching, adjustment, comparison, report"
@@ -97,19 +112,20 @@ _TEXTURE = "tie points, orientation, matching, adjustment, comparison, report"
 # targets on texture, and the image points of stereo10, camcal and fountain-P11. In the first two, whose
 # photographs are real, causes of errors are found and tried.
 TYPICAL = (
-    _typical(Work(("targets",), 21, 3.87), _TARGETS, 3.5, 0.2, 0.4, 7.6, 0.7, 1.6),
-    _typical(Work(("targets",), 28, 0.31), _TARGETS, 1.2, 0.1, 0.3, 6.6, 0.4, 1.2),
-    _typical(Work(("targets",), 12, 1.92), _TARGETS, 4.3, 0.4, 0.3, 0.3, 0.4, 1.2),
-    _typical(Work(("texture",), 11, 1.57), _TEXTURE, 3.2, 1.7, 8.8, 8.4, 1.9, 5.9),
-    _typical(Work(("texture",), 11, 6.29), _TEXTURE, 7.0, 2.0, 12.0, 8.0, 2.0, 6.0),
+    _typical(Work(("targets",), 21, 3.87), _TARGETS, 3.5, 0.2, 0.4, 7.6, 0.7, 1.6, memory_mb=600),
+    _typical(Work(("targets",), 28, 0.31), _TARGETS, 1.2, 0.1, 0.3, 6.6, 0.4, 1.2, memory_mb=500),
+    _typical(Work(("targets",), 12, 1.92), _TARGETS, 4.3, 0.4, 0.3, 0.3, 0.4, 1.2, memory_mb=500),
+    _typical(Work(("texture",), 11, 1.57), _TEXTURE, 3.2, 1.7, 8.8, 8.4, 1.9, 5.9, memory_mb=811),
+    _typical(Work(("texture",), 11, 6.29), _TEXTURE, 7.0, 2.0, 12.0, 8.0, 2.0, 6.0, memory_mb=1100),
     _typical(
         Work(("targets", "texture"), 30, 0.31),
         "photographs, targets, tie points, orientation, matching, adjustment, comparison, report",
         *(6.1, 0.1, 4.6, 1.9, 9.2, 3.7, 1.0, 4.0),
+        memory_mb=700,
     ),
-    _typical(Work(("given",), 2, 0.0, 20), _GIVEN, 0.1, 0.1, 0.1, 0.6),
-    _typical(Work(("given",), 21, 0.0, 2049), _GIVEN, 0.2, 2.9, 0.4, 1.6),
-    _typical(Work(("given",), 11, 0.0, 30331), _GIVEN, 0.5, 15.0, 2.0, 2.4),
+    _typical(Work(("given",), 2, 0.0, 20), _GIVEN, 0.1, 0.1, 0.1, 0.6, memory_mb=400),
+    _typical(Work(("given",), 21, 0.0, 2049), _GIVEN, 0.2, 2.9, 0.4, 1.6, memory_mb=430),
+    _typical(Work(("given",), 11, 0.0, 30331), _GIVEN, 0.5, 15.0, 2.0, 2.4, memory_mb=600),
 )
 
 
@@ -120,10 +136,58 @@ def expected_seconds(work: Work, runs: Sequence[Run]) -> dict[str, float]:
         work: of the survey.
         runs: earlier runs of the user, the last one last.
     """
+    nearest = _nearest(work, runs)
+    return {} if nearest is None else nearest.scaled_to(work)
+
+
+def expected_memory_mb(work: Work, runs: Sequence[Run]) -> float:
+    """Return the expected peak of the memory of a survey, 10^6 bytes; 0 where none was alike.
+
+    Args:
+        work: of the survey.
+        runs: earlier runs of the user, the last one last.
+    """
+    nearest = _nearest(work, [run for run in runs if run.memory_mb > 0])
+    return 0.0 if nearest is None else nearest.memory_scaled_to(work)
+
+
+def announced(work: Work, runs: Sequence[Run]) -> str:
+    """Return one sentence on the time and memory of a long survey; empty for others.
+
+    Args:
+        work: of the survey.
+        runs: earlier runs of the user, the last one last.
+
+    Raises:
+        KolinearError: it needs much more memory than there is.
+    """
+    memory, there = expected_memory_mb(work, runs), available_mb()
+    if memory > MEMORY_MARGIN * there:
+        raise KolinearError(
+            f"the survey needs about {memory / 1000:.1f} GB of memory, and {there / 1000:.1f} GB are free: "
+            "end other programs, use a larger computer, or take fewer photographs or smaller ones"
+        )
+    seconds = expected_seconds(work, runs)
+    whole = sum(seconds.values())
+    if whole < LONG_SECONDS:
+        return ""
+    parts = ", ".join(f"{stage} {duration(of_stage)}" for stage, of_stage in seconds.items() if of_stage >= 1)
+    return f"expected: {duration(whole)} ({parts}) and {memory / 1000:.1f} GB of memory"
+
+
+def duration(seconds: float) -> str:
+    """Return a rough time in words."""
+    if seconds < 100:
+        return f"{seconds:.0f} s"
+    return f"{seconds / 60:.0f} min" if seconds < 6000 else f"{seconds / 3600:.1f} h"
+
+
+def _nearest(work: Work, runs: Sequence[Run]) -> Run | None:
+    """Return the run whose work is nearest, of the user if there is a choice; None where none is alike."""
     apart = [(run.work.distance(work), -k, run) for k, run in enumerate(runs)]
     apart += [(run.work.distance(work) + OTHERS_APART, 1, run) for run in TYPICAL]
     distance, _, nearest = min(apart, key=lambda row: row[:2])
-    return nearest.scaled_to(work) if math.isfinite(distance) else {}
+    return nearest if math.isfinite(distance) else None
 
 
 class RunHistory:
@@ -157,10 +221,11 @@ class RunHistory:
                     pixels = float(row["megapixels"])
                     work = Work(tuple(map(str, row["sources"])), int(row["photographs"]), pixels, given)
                     seconds = {str(stage): float(took) for stage, took in row["seconds"].items()}
-                    numbers = (work.photographs, pixels, given / LARGEST, *seconds.values())
+                    memory = float(row.get("memory_mb", 0.0))  # runs of earlier versions do not state it
+                    numbers = (work.photographs, pixels, given / LARGEST, memory, *seconds.values())
                     in_range = all(0 <= number <= LARGEST for number in numbers)
                     if in_range and work.photographs and not 0 < work.megapixels < 1 / LARGEST:
-                        runs.append(Run(work, seconds))
+                        runs.append(Run(work, seconds, memory))
         return runs
 
     def add(self, run: Run) -> None:
@@ -168,7 +233,10 @@ class RunHistory:
         if not self.is_kept:
             return
         kept = [*self.read()[1 - KEPT_RUNS :], run]
-        lines = [json.dumps(asdict(each.work) | {"seconds": each.seconds}) for each in kept]
+        lines = [
+            json.dumps(asdict(each.work) | {"seconds": each.seconds, "memory_mb": each.memory_mb})
+            for each in kept
+        ]
         with suppress(OSError, OutputError):
             make_user_folder(self.path.parent)
             with whole_file(self.path, replaces=True) as part:

@@ -10,14 +10,19 @@ from pathlib import Path
 import pytest
 from rich.console import Console
 
+from sfm.model.errors import KolinearError
+from sfm.runtime import forecast
 from sfm.runtime.forecast import (
     KEPT_RUNS,
+    PROGRAM_MB,
     TYPICAL,
     BatchCountdown,
     Countdown,
     Run,
     RunHistory,
     Work,
+    announced,
+    expected_memory_mb,
     expected_seconds,
     slowness,
 )
@@ -27,7 +32,7 @@ from sfm.survey.inputs.survey import read_survey
 from tests.surveys import write_photograph_survey
 
 SMALL = Run(Work(("targets",), 10, 1.0), {"targets": 5.0, "orientation": 1.0, "adjustment": 2.0})
-LARGE = Run(Work(("targets",), 100, 1.0), {"targets": 40.0, "orientation": 30.0, "adjustment": 50.0})
+LARGE = Run(Work(("targets",), 100, 1.0), {"targets": 40.0, "orientation": 30.0, "adjustment": 50.0}, 900.0)
 
 
 def test_the_nearest_run_of_the_same_sources_is_scaled() -> None:
@@ -132,6 +137,35 @@ def test_surveys_of_given_image_points_are_scaled_by_these() -> None:
     many = Run(Work(("given",), 10, 0.0, 100_000), {"adjustment": 1000.0, "orientation": 20.0})
     expected = expected_seconds(Work(("given",), 40, 0.0, 50_000), [many, few])
     assert expected == pytest.approx({"adjustment": 1000.0 * 0.5**0.6, "orientation": 20.0 * 0.5**0.6})
+
+
+def test_memory_grows_with_the_work_beyond_that_of_the_program() -> None:
+    few = Run(Work(("given",), 10, 0.0, 1000), {"adjustment": 1.0}, PROGRAM_MB + 10.0)
+    many = Run(Work(("given",), 10, 0.0, 100_000), {"adjustment": 9.0}, PROGRAM_MB + 800.0)
+    later = Run(Work(("given",), 10, 0.0, 100_000), {"adjustment": 9.0})  # of an earlier version
+    runs = [few, many, later]
+    assert expected_memory_mb(many.work, runs) == many.memory_mb
+    assert expected_memory_mb(Work(("given",), 10, 0.0, 50_000), runs) == pytest.approx(PROGRAM_MB + 400.0)
+    assert expected_memory_mb(Work(("given",), 10, 0.0, 1500), runs) == pytest.approx(PROGRAM_MB + 15.0)
+    assert expected_memory_mb(Work(("unheard of",), 10), runs) == 0.0
+    texture = Run(Work(("texture",), 20, 4.0), {"tie points": 1.0}, PROGRAM_MB + 500.0)
+    assert expected_memory_mb(Work(("texture",), 20, 4.0), [texture]) == texture.memory_mb
+    larger = expected_memory_mb(Work(("texture",), 40, 4.0), [texture])
+    assert texture.memory_mb < larger < PROGRAM_MB + 1000.0
+    for run in TYPICAL:
+        assert expected_memory_mb(run.work, []) == pytest.approx(run.memory_mb)
+
+
+def test_a_long_survey_is_announced_and_one_without_room_refused(monkeypatch: pytest.MonkeyPatch) -> None:
+    assert announced(SMALL.work, [SMALL]) == ""
+    assert announced(Work(("unheard of",), 10), [SMALL]) == ""
+    long = Run(Work(("targets",), 500, 1.0), {"targets": 0.4, "adjustment": 7000.0, "report": 130.0}, 6600.0)
+    expected = "expected: 2.0 h (adjustment 1.9 h, report 2 min) and 6.6 GB of memory"
+    monkeypatch.setattr(forecast, "available_mb", lambda: 6000.0)
+    assert announced(long.work, [long]) == expected
+    monkeypatch.setattr(forecast, "available_mb", lambda: 5000.0)
+    with pytest.raises(KolinearError, match=r"needs about 6\.6 GB of memory, and 5\.0 GB are free"):
+        announced(long.work, [long])
 
 
 def test_a_stage_that_finds_more_to_do_says_nothing_of_the_others() -> None:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import sys
 from dataclasses import replace
 from pathlib import Path
 from typing import Annotated
@@ -77,7 +78,8 @@ def audit(
             write_result,
         )
         from sfm.report.pages import page_of, texts_of
-        from sfm.runtime.forecast import Run, RunHistory, expected_seconds
+        from sfm.runtime.forecast import Run, RunHistory, announced, expected_seconds
+        from sfm.runtime.memory import peak_mb
         from sfm.runtime.progress_bar import drawn_progress
         from sfm.runtime.threads import cores, one_blas_thread
         from sfm.survey.inputs.measurements import NO_PHOTOGRAPHS, work_of
@@ -106,7 +108,10 @@ def audit(
         SurveyLog(watch=drawn) as log,
     ):
         history, work = RunHistory.of_user(), work_of(audited, NO_PHOTOGRAPHS)
-        expected = expected_seconds(work, history.read())
+        runs = history.read()
+        if sentence := announced(work, runs):
+            print(sentence, file=sys.stderr)
+        expected = expected_seconds(work, runs)
         drawn.countdown.expected = {stage: s for stage, s in expected.items() if stage != "comparison"}
         log.start(audited.name, model, **origin.written(folder))
         with reporting_unfinished(folder, log, pdf=pdf):
@@ -121,7 +126,7 @@ def audit(
             log.close_into(part, findings)
 
         write_result(findings, folder, finish=finish, progress=log)
-        history.add(Run(work, drawn.finished()))
+        history.add(Run(work, drawn.finished(), peak_mb()))
     print_verdict(page.verdict)
     for note in (*notes, *judged.like):
         print(f"{model}: {note}")
