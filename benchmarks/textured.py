@@ -36,7 +36,7 @@ HEAD = (
     "scene            method           images  points   centre mm  rotation mdeg  predicted mm  ratio"
     "  Mahalanobis/dof  cpu s"
 )
-METHODS = ["colmap", "kolinear"]
+METHODS = ["colmap", "colmap-global", "kolinear"]
 
 
 def main() -> None:
@@ -63,6 +63,8 @@ def main() -> None:
                 of_scene.append(_kolinear(scene, folder, arguments.jobs))
             if "colmap" in arguments.methods:
                 of_scene += _colmap(scene, folder)
+            if "colmap-global" in arguments.methods:
+                of_scene.append(_colmap_global(scene, folder))
             seconds.append(of_scene)
         if len(arguments.photographs) > 1:
             power = np.polyfit(np.log(arguments.photographs), np.log(seconds), 1)[0]
@@ -98,6 +100,16 @@ def _colmap(scene: TexturedScene, folder: Path) -> list[float]:
     whole = time.process_time() - begun
     _print(scene, folder.name, "COLMAP + refine", a.network, a.estimate, whole, a)
     return [seconds, whole]
+
+
+def _colmap_global(scene: TexturedScene, folder: Path) -> float:
+    """Run COLMAP's pipeline with its global mapper, print its errors and return its processor time."""
+    begun = time.process_time()
+    names = tuple(sorted(path.name for path in folder.glob("*.png")))
+    mapped = map_photographs(folder, (names,), at_once=True)
+    seconds = time.process_time() - begun
+    _print(scene, folder.name, "COLMAP, global", mapped.network, mapped.estimate, seconds)
+    return seconds
 
 
 def _print(

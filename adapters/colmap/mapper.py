@@ -6,7 +6,8 @@ The pipeline is what users would run instead of a survey: without targets, scale
 Sensor widths come from COLMAP's list of cameras. pycolmap gives them only through the focal length that it
 infers for a photograph. It therefore gets a small picture with the make, the model and a known focal length.
 
-Source: Schoenberger and Frahm (2016), Structure-from-Motion revisited, CVPR; the pipeline of pycolmap 4.2.
+Source: Schoenberger and Frahm (2016), Structure-from-Motion revisited, CVPR; Pan, Barath, Pollefeys and
+Schoenberger (2024), Global Structure-from-Motion revisited, ECCV; the pipelines of pycolmap 4.2.
 """
 
 from __future__ import annotations
@@ -46,13 +47,14 @@ class MapperBaseline:
 
 
 def map_photographs(
-    folder: Path, cameras: tuple[tuple[str, ...], ...], *, threads: int = -1
+    folder: Path, cameras: tuple[tuple[str, ...], ...], *, at_once: bool = False, threads: int = -1
 ) -> MapperBaseline:
     """Run COLMAP's pipeline on photographs and return its largest model.
 
     Args:
         folder: folder of the photographs.
         cameras: for each camera the names of its photographs, relative to the folder.
+        at_once: whether all photographs are oriented together, by the global mapper, instead of one by one.
         threads: threads of COLMAP; -1 uses all cores.
 
     Raises:
@@ -68,7 +70,8 @@ def map_photographs(
             matching = pycolmap.FeatureMatchingOptions()
             reader = pycolmap.ImageReaderOptions()
             reader.camera_model = MODEL
-            pipeline = pycolmap.IncrementalPipelineOptions()
+            mapping = pycolmap.global_mapping if at_once else pycolmap.incremental_mapping
+            pipeline = pycolmap.GlobalPipelineOptions() if at_once else pycolmap.IncrementalPipelineOptions()
             extraction.num_threads = matching.num_threads = pipeline.num_threads = threads
             extraction.use_gpu = matching.use_gpu = False
             for names in cameras:
@@ -81,7 +84,7 @@ def map_photographs(
                     extraction_options=extraction,
                 )
             pycolmap.match_exhaustive(database, matching_options=matching)
-            models = pycolmap.incremental_mapping(database, folder, work, pipeline)
+            models = mapping(database, folder, work, pipeline)
             if not models:
                 raise BackendError("COLMAP's mapper found no model: too few matches between the photographs")
             best = max(models.values(), key=lambda scene: scene.num_reg_images())

@@ -265,6 +265,26 @@ def test_blocks_give_the_adjustment_in_one_piece(name: str) -> None:
         assert in_sigmas(joint[np.ix_(here, here)], reference[np.ix_(here, here)]) < exact
 
 
+def test_blocks_without_control_are_placed_by_their_neighbours() -> None:
+    """Control is in two opposite quarters of the area only; blocks adjusted alone would not fit to them."""
+    network, truth = aerial("control in two quarters", 10, 14, 2400)
+    rng, ground = np.random.default_rng(seed_of("two quarters")), truth.points[:, :2]
+    upper = ground > np.median(ground, axis=0)
+    without = upper[:, 0] != upper[:, 1]
+    index, sigma = np.flatnonzero(~without)[::120], 0.02
+    given = truth.points[index] + sigma * rng.standard_normal((len(index), 3))
+    control = ObjectPoints(index, given, np.tile(sigma**2 * np.eye(3), (len(index), 1, 1)))
+    options = {"reject": "none", "datum": Datum("control")}
+    case = Case(network.with_given(control), spoiled(truth, "two quarters", 0.1), options)
+    blocks, whole = in_this_process(case, 4), in_this_process(case, None)
+    assert_same(blocks, whole, EXACT)
+    error = (blocks.estimate.points - truth.points)[without]
+    expected = np.sqrt(np.diagonal(blocks.covariance.points, axis1=1, axis2=2))[without]
+    z = error / expected
+    assert 0.8 < np.sqrt(np.mean(z**2)) < 1.25
+    assert np.abs(z).max() < 5.0
+
+
 def test_networks_are_cut_where_blocks_save_time_or_their_number_is_stated(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:

@@ -303,10 +303,11 @@ def test_photographs_without_texture_give_no_model(tmp_path: Path, capfd: pytest
 @pytest.mark.skipif(
     not PHOTOGRAPHS.is_dir(), reason="photographs of retro-panel are not beside the repository"
 )
-def test_retro_panel_is_oriented_by_colmaps_own_pipeline() -> None:
+@pytest.mark.parametrize("at_once", [False, True])
+def test_retro_panel_is_oriented_by_colmaps_own_pipeline(at_once: bool) -> None:
     names = sorted(path.name for path in PHOTOGRAPHS.glob("*.tif"))
     cameras = tuple(tuple(n for n in names if n.startswith(key)) for key in ("043", "671"))
-    found = map_photographs(PHOTOGRAPHS, cameras)
+    found = map_photographs(PHOTOGRAPHS, cameras, at_once=at_once)
     assert found.total == 8
     assert len(found.network.images) == 8
     assert 0.1 < found.rms_px < 0.5  # 0.31 px when written
