@@ -16,6 +16,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import replace
 from itertools import permutations, product
+from typing import NamedTuple
 
 import numpy as np
 
@@ -27,21 +28,19 @@ from sfm.model.conventions import (
     IntArray,
     rotation_from_angles,
     rotation_from_vector,
-    skew,
 )
 from sfm.model.display import counted
 from sfm.model.errors import GeometryError
-from sfm.model.estimate import Estimate, values_of
+from sfm.model.estimate import AdjustedValues, Estimate, values_of
 from sfm.model.network import Network
-from sfm.model.observations.control_and_bars import ScaleBars
-from sfm.model.observations.kind import PHOTOGRAPH, POINT, Kind, TableKind, inverse_of_observed
+from sfm.model.observations.kind import PHOTOGRAPH, POINT, RowKind, TableKind, is_observed
+from sfm.model.observations.point_pairs import Distances
 from sfm.model.observations.pose import MountObservations
 from sfm.model.similarity import Similarity, fit_similarity, nearest_rotation
 
-Weighted = TableKind | ScaleBars  # with one standard deviation for each value
-
-ROUGH_ROUNDS, ROUNDS = 6, 20  # Gauss-Newton steps from each attitude, and from the best attitudes
+ROUGH_ROUNDS, ROUNDS = 6, 20  # most Gauss-Newton steps from each attitude, and from the best attitudes
 BEST = 3  # attitudes that are fitted to the end
+LAST_STEP = 1e-7  # rad, of the extent, and of the scale: with a smaller step the fit ends
 MIN_FRACTION = 1e-9  # of the derivatives, below which the effect of a motion is only rounding
 MAX_STEP = 0.5  # largest rotation of one step, rad, and largest change of ln(scale)
 MIN_POINTS = 3  # that fix position, attitude and scale
@@ -74,12 +73,12 @@ def place_on_observations(network: Network, estimate: Estimate) -> Estimate:
             R[np.arange(3), list(order)] = signs
             if np.linalg.det(R) > 0:
                 attitudes.append(R)
-    turned = [Similarity(1.0, R, np.zeros(3)).apply_estimate(start) for R in attitudes]
-    tried = [_fitted(kinds, candidate, ROUGH_ROUNDS, scaled=scaled) for candidate in turned]
-    best = sorted(tried, key=lambda fit: fit[1])[:BEST]
-    return min(
-        (_fitted(kinds, candidate, ROUNDS, scaled=scaled) for candidate, _ in best), key=lambda fit: fit[1]
-    )[0]
+    count = len(attitudes)
+    tried = _Motions(start, np.ones(count), np.stack(attitudes), np.zeros((count, 3)))
+    tried, cost = _fitted(kinds, tried, ROUGH_ROUNDS, scaled=scaled)
+    best, cost = _fitted(kinds, tried.select(np.argsort(cost, kind="stable")[:BEST]), ROUNDS, scaled=scaled)
+    k = int(np.argmin(cost))
+    return Similarity(float(best.scale[k]), best.rotation[k], best.shift[k]).apply_estimate(start)
 
 
 def scale_sigma(network: Network, estimate: Estimate) -> float:
@@ -97,7 +96,7 @@ def scale_sigma(network: Network, estimate: Estimate) -> float:
     return 1 / left if left > rounding else float("inf")
 
 
-def _about_centre(kinds: Sequence[Kind], estimate: Estimate) -> tuple[Estimate, FloatArray, float]:
+def _about_centre(kinds: Sequence[TableKind], estimate: Estimate) -> tuple[Estimate, FloatArray, float]:
     """Return an estimate about its centre, its observations' derivatives by motions, and their rounding.
 
     Returns:
@@ -106,20 +105,24 @@ def _about_centre(kinds: Sequence[Kind], estimate: Estimate) -> tuple[Estimate, 
     """
     centre = np.nanmean(estimate.points, axis=0)
     start = Similarity(1.0, np.eye(3), -centre).apply_estimate(estimate)
-    rows, _ = _rows(kinds, start)
-    size, norm = float(np.nanmax(np.abs(start.points))), 0.0
-    rows[:, :3] *= size
+    still = _Motions(start, np.ones(1), np.eye(3)[None], np.zeros((1, 3)))
+    rows, norm = [], 0.0
     for kind in kinds:
-        J = np.concatenate([by.ravel() for by in kind.linearise(values_of(start)).J])
-        norm += float(np.linalg.norm(J) * np.sqrt(inverse_of_observed(kind.covariances()).max()))
-    return start, rows, MIN_FRACTION * size * norm
+        linear = _linearised(kind, still, kind.sigma.reshape(1, -1))
+        root = _inverse_of(kind.sigma.ravel())
+        rows.append(root[:, None] * linear.J[0])
+        norm += linear.norm * float(root.max())
+    by_motion = np.concatenate(rows)
+    by_motion[:, :3] *= still.size
+    return start, by_motion, MIN_FRACTION * still.size * norm
 
 
-def _of_motions(network: Network, estimate: Estimate) -> list[Weighted]:
+def _of_motions(network: Network, estimate: Estimate) -> list[TableKind]:
     """Return scale bars and tabulated observations whose points and photographs have start values."""
     tables = (kind for kind in network.further if isinstance(kind, TableKind))
-    kinds: tuple[Weighted, ...] = (network.scale_bars, *tables)
-    usable = []
+    bars = network.scale_bars
+    kinds = (Distances(bars.start, bars.end, bars.values, bars.sigma[:, None]), *tables)
+    usable = list[TableKind]()
     for kind in kinds:
         on = np.ones(len(kind), dtype=bool)
         for of, at in kind.blocks():
@@ -131,54 +134,116 @@ def _of_motions(network: Network, estimate: Estimate) -> list[Weighted]:
     return [kind for kind in usable if len(kind)]
 
 
+class _Motions(NamedTuple):
+    """Positions, attitudes and scales of an estimate: X = scale R x + shift, a of them."""
+
+    start: Estimate
+    scale: FloatArray  # (a,)
+    rotation: FloatArray  # R, (a, 3, 3)
+    shift: FloatArray  # (a, 3)
+
+    @property
+    def size(self) -> float:
+        """Largest coordinate of the points of the estimate."""
+        return float(np.nanmax(np.abs(self.start.points)))
+
+    def select(self, at: IntArray) -> _Motions:
+        """Return the motions of the given indices."""
+        return _Motions(self.start, self.scale[at], self.rotation[at], self.shift[at])
+
+    def then(self, step: FloatArray) -> _Motions:
+        """Return the motions followed by a shift, a rotation vector and a change of ln(scale), (a, 7)."""
+        R, scale = rotation_from_vector(step[:, 3:6]), np.exp(step[:, 6])
+        shift = scale[:, None] * np.einsum("aij,aj->ai", R, self.shift) + step[:, :3]
+        return _Motions(self.start, scale * self.scale, R @ self.rotation, shift)
+
+    def values(self) -> AdjustedValues:
+        """Return the values after all motions, one behind the other."""
+        values, R = values_of(self.start), np.swapaxes(self.rotation, 1, 2)
+        points, position = (
+            (self.scale[:, None, None] * (X @ R) + self.shift[:, None]).reshape(-1, 3)
+            for X in (values.points, values.position)
+        )
+        M = (values.M @ R[:, None]).reshape(-1, 3, 3)
+        return values._replace(points=points, position=position, M=M)
+
+
+class _ByMotions(NamedTuple):
+    """Observations after a motions, with derivatives by further ones."""
+
+    difference: FloatArray  # computed minus observed, (a, n d)
+    J: FloatArray  # derivatives by shift, rotation and ln(scale), (a, n d, 7)
+    norm: float  # of the derivatives by all unknowns
+
+
 def _fitted(
-    kinds: list[Weighted], estimate: Estimate, rounds: int, *, scaled: bool
-) -> tuple[Estimate, float]:
-    """Return the estimate, moved and scaled to the least sum of absolute residuals over sigma, and this sum.
+    kinds: Sequence[TableKind], motions: _Motions, rounds: int, *, scaled: bool
+) -> tuple[_Motions, FloatArray]:
+    """Return motions to the least sum of absolute residuals over sigma, and this sum, (a,).
 
     With a sum of squares one mistyped value would decide. Weights of 1 over the residual turn it into a sum
     of absolute values (Foerstner and Wrobel 2016, sec. 4.7.4).
     """
-    weighted = kinds
+    count, size = len(motions.scale), motions.size
+    stated = [np.broadcast_to(kind.sigma.ravel(), (count, kind.sigma.size)) for kind in kinds]
+    sigma = stated
+    linear = [_linearised(kind, motions, of) for kind, of in zip(kinds, sigma, strict=True)]
     for _ in range(rounds):
-        rows, l = _rows(weighted, estimate)
-        rows[:, 6] *= scaled
-        step: FloatArray = np.asarray(-np.linalg.lstsq(rows, l, rcond=1e-9)[0], dtype=float)
-        size = max(float(np.abs(step[3:]).max()), MAX_STEP) / MAX_STEP
-        step /= size
-        R = rotation_from_vector(step[3:6])
-        estimate = Similarity(float(np.exp(step[6])), R, step[:3]).apply_estimate(estimate)
-        away = []  # absolute residuals over the stated sigma
-        for kind, reweighted in zip(kinds, weighted, strict=True):
-            difference = reweighted.linearise(values_of(estimate)).difference
-            away.append(np.asarray(np.abs(difference.reshape(kind.sigma.shape)) / kind.sigma))
-        weighted = [
-            kind.with_sigma(kind.sigma * np.sqrt(np.maximum(over, 1.0)))
-            for kind, over in zip(kinds, away, strict=True)
-        ]
-    return estimate, sum(float(over.sum()) for over in away)
+        root = np.concatenate([_inverse_of(of) for of in sigma], axis=1)
+        rows = root[:, :, None] * np.concatenate([of.J for of in linear], axis=1)
+        rows[:, :, 6] *= scaled
+        l = root * np.concatenate([of.difference for of in linear], axis=1)
+        step = -np.einsum("aij,aj->ai", np.linalg.pinv(rows, rcond=1e-9), l)
+        step /= np.maximum(np.abs(step[:, 3:]).max(axis=1, keepdims=True), MAX_STEP) / MAX_STEP
+        motions = motions.then(step)
+        linear = [_linearised(kind, motions, of) for kind, of in zip(kinds, sigma, strict=True)]
+        away = [np.abs(of.difference) / by for of, by in zip(linear, stated, strict=True)]
+        if np.abs(step / ([size] * 3 + [1.0] * 4)).max() < LAST_STEP:
+            break
+        sigma = [by * np.sqrt(np.maximum(over, 1.0)) for by, over in zip(stated, away, strict=True)]
+    return motions, np.concatenate(away, axis=1).sum(axis=1)
 
 
-def _rows(kinds: Sequence[Kind], estimate: Estimate) -> tuple[FloatArray, FloatArray]:
-    """Return whitened derivatives by shift, rotation and scale, (n, 7), and differences, (n,)."""
-    values, rows, differences = values_of(estimate), [], []
-    for kind in kinds:
-        linear = kind.linearise(values)
-        J = np.zeros((*linear.difference.shape, 7))
-        for (of, at), by in zip(kind.blocks(), linear.J, strict=True):
-            X = values.points[at] if of == POINT else values.position[at]
-            motion = np.zeros((len(at), by.shape[2], 7))
-            motion[:, :3, :3] = np.eye(3)
-            motion[:, :3, 3:6] = -skew(X)
-            motion[:, :3, 6] = X
+def _inverse_of(sigma: FloatArray) -> FloatArray:
+    """Return 1 over standard deviations, 0 of values that are fixed or unknown."""
+    on = is_observed(sigma)
+    return np.where(on, 1 / np.where(on, sigma, 1.0), 0.0)
+
+
+def _linearised(kind: TableKind, motions: _Motions, sigma: FloatArray) -> _ByMotions:
+    """Return observations after motions, with their standard deviations after each, (a, n d).
+
+    Rows are computed for all motions at once, as those of a network with as many copies of each point.
+    """
+    values, count = motions.values(), len(motions.scale)
+    n, m = len(motions.start.points), len(motions.start.position)
+    copies = list[tuple[TableKind, AdjustedValues]]()
+    if isinstance(kind, RowKind):
+        first = np.arange(count)[:, None]
+        places = tuple((at + first * (n if of == POINT else m)).ravel() for of, at in kind.blocks())
+        observed = np.tile(np.hstack([kind.without_sigma, kind.values]), (count, 1))
+        copies.append((kind.of_table(places, observed, sigma.reshape(len(observed), -1)), values))
+    else:
+        points, position = values.points.reshape(count, n, 3), values.position.reshape(count, m, 3)
+        M = values.M.reshape(count, m, 3, 3)
+        for k in range(count):
+            of_motion = values._replace(points=points[k], position=position[k], M=M[k])
+            copies.append((kind.with_sigma(sigma[k].reshape(kind.sigma.shape)), of_motion))
+    difference, J, norm = [], [], 0.0
+    for of_copy, at_copy in copies:
+        linear, blocks = of_copy.linearise(at_copy), of_copy.blocks()
+        X = np.stack([at_copy.points[at] if of == POINT else at_copy.position[at] for of, at in blocks])
+        by = np.stack([derivatives[:, :, :3] for derivatives in linear.J])  # (blocks, n, d, 3)
+        turn, scale = np.cross(X[:, :, None], by).sum(axis=0), np.einsum("bni,bndi->nd", X, by)
+        for (of, at), derivatives in zip(blocks, linear.J, strict=True):
             if of == PHOTOGRAPH:
-                motion[:, 3:, 3:6] = values.M[at]
-            J += by @ motion
-        weight = inverse_of_observed(kind.covariances())
-        F = np.swapaxes(np.linalg.cholesky(weight), 1, 2)
-        rows.append((F @ J).reshape(-1, 7))
-        differences.append(np.einsum("nab,nb->na", F, linear.difference).ravel())
-    return np.concatenate(rows), np.concatenate(differences)
+                turn += derivatives[:, :, 3:] @ at_copy.M[at]
+            norm += float((derivatives**2).sum())
+        J.append(np.concatenate([by.sum(axis=0), turn, scale[:, :, None]], axis=2))
+        difference.append(linear.difference)
+    return _ByMotions(
+        np.stack(difference).reshape(count, -1), np.stack(J).reshape(count, -1, 7), float(np.sqrt(norm))
+    )
 
 
 def place_on_exterior(network: Network, estimate: Estimate) -> Estimate:

@@ -232,13 +232,19 @@ def test_heights_level_a_survey_and_distances_scale_it(tmp_path: Path) -> None:
     assert {name: len(values) for name, values in stored.items()} == {"height difference": 12}
 
 
-def test_start_values_in_any_attitude_come_to_the_observations() -> None:
+@pytest.mark.parametrize("kinds", [("height difference", "antenna position"), ("zenith angle",)])
+def test_start_values_in_any_attitude_come_to_the_observations(kinds: tuple[str, ...]) -> None:
+    """Angles from Z give no scale and no azimuth, only which way is up."""
     from sfm.survey.placing import place_on_observations
 
-    network, truth = network_of("attitude", ("height difference", "antenna position"))
-    turned = Similarity(0.3, rotation_from_vector(np.array([2.0, -1.0, 0.5])), np.array([5.0, 1.0, 2.0]))
-    placed = place_on_observations(network, turned.apply_estimate(truth))
-    assert placed.points == pytest.approx(truth.points, abs=1e-3)
+    network, truth = network_of("attitude", kinds)
+    for vector in ([2.0, -1.0, 0.5], *seed_of("attitudes").normal(0.0, 2.0, (12, 3))):
+        turned = Similarity(0.3, rotation_from_vector(np.array(vector)), np.array([5.0, 1.0, 2.0]))
+        placed = place_on_observations(network, turned.apply_estimate(truth))
+        if "antenna position" in kinds:
+            assert placed.points == pytest.approx(truth.points, abs=1e-3)
+        up, known = (X[:, 2] - X[:, 2].mean() for X in (placed.points, truth.points))
+        assert up / up.std() == pytest.approx(known / known.std(), abs=1e-2)
     assert place_on_observations(network.with_given(further=()), truth) is truth
 
 

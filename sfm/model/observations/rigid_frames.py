@@ -13,6 +13,7 @@ from scipy.linalg import block_diag
 from sfm.model.conventions import FloatArray, rotation_from_vector, skew
 from sfm.model.observations.kind import Fit, Group, Names, OwnParameters, Values, inverse_of_determined
 
+ROUNDING = 1e-13  # of the frame: a smaller step of its motion is only rounding
 ON_LINE = 1e-6  # share of the largest singular value below which a rotation does not change given coordinates
 
 
@@ -73,7 +74,9 @@ class RigidFrames(Group):
         H, about = self._by_motion(local)
         Jx = np.zeros((len(X), 3, len(X), 3))
         Jx[np.arange(len(X)), :, np.arange(len(X))] = R.T
-        return Fit(local - self.value, self._without(about, Jx), self._without(about, H))
+        if len(self._axes[1]):
+            Jx, H = self._without(about, Jx), self._without(about, H)
+        return Fit(local - self.value, Jx, H)
 
     def _fitted(self, X: FloatArray) -> tuple[FloatArray, FloatArray]:
         """Return the motion R, t that fits the frame to its points best: X near R local + t."""
@@ -82,17 +85,17 @@ class RigidFrames(Group):
         a, b = ((x * w[:, None]).sum(axis=0) / w.sum() for x in (self.value, X))
         U, _, Vt = np.linalg.svd((X - b).T @ ((self.value - a) * w[:, None]))
         R = U @ np.diag([1.0, 1.0, np.linalg.det(U @ Vt)]) @ Vt
-        t = b - R @ a
+        t, size, root = b - R @ a, np.abs(self.value - a).max(), np.sqrt(W)
         for _ in range(5):  # iterations with the weights of single coordinates
             local = (X - t) @ R
             H, _ = self._by_motion(local)
-            root = np.sqrt(W)
             rows, l = root.reshape(-1, 1) * H.reshape(-1, 6), (root * (local - self.value)).ravel()
             step: FloatArray = np.asarray(-np.linalg.lstsq(rows, l, rcond=1e-12)[0], dtype=float)
-            centre = self.value.mean(axis=0)
             turned = R @ rotation_from_vector(step[3:])
-            t = t + R @ step[:3] + (R - turned) @ centre
+            t = t + R @ step[:3] + (R - turned) @ self._centre
             R = turned
+            if max(np.abs(step[:3]).max(), size * np.abs(step[3:]).max()) < ROUNDING * size:
+                break
         return R, t
 
     def mistakes(self) -> Mapping[str, Self]:
@@ -108,15 +111,23 @@ class RigidFrames(Group):
         Args:
             local: R'(X - t), (p, 3).
         """
-        shift = np.tile(-np.eye(3), (len(local), 1, 1))
-        moments = skew(local - self.value.mean(axis=0))
-        turn, about = (moments @ axes.T @ axes for axes in self._axes)
-        return np.concatenate([shift, turn], axis=2), about
+        moments, H = skew(local - self._centre), np.zeros((len(local), 3, 6))
+        H[:, :, :3] = -np.eye(3)
+        (on, off), H[:, :, 3:] = self._axes, moments
+        if not len(off):
+            return H, np.zeros((len(local), 3, 3))
+        H[:, :, 3:] = moments @ on.T @ on
+        return H, moments @ off.T @ off
+
+    @cached_property
+    def _centre(self) -> FloatArray:
+        """Return the mean of the given coordinates, (3,)."""
+        return np.asarray(self.value.mean(axis=0))
 
     @cached_property
     def _axes(self) -> tuple[FloatArray, FloatArray]:
         """Return the axes of rotations that change the given coordinates, (3 or 2, 3), and any other axis."""
-        given = skew(self.value - self.value.mean(axis=0)).reshape(-1, 3)
+        given = skew(self.value - self._centre).reshape(-1, 3)
         _, singular, Vt = np.linalg.svd(given, full_matrices=False)
         on = singular > ON_LINE * singular[0]
         return Vt[on], Vt[~on]
