@@ -45,6 +45,15 @@ class Lamp(NamedTuple):
     """light from all directions"""
 
 
+class Ends(NamedTuple):
+    """Directions of the ends of an arc, or of the sides of a rectangle (the first)."""
+
+    cos_start: float
+    sin_start: float
+    cos_end: float
+    sin_end: float
+
+
 @compiled
 def fill_face(
     value: AnyArray,
@@ -78,11 +87,12 @@ def fill_face(
         lamp: the light.
         n: cells along a pixel.
     """
+    ends = ends_of(rectangle)
     for y in range(box[0] // n, box[1] // n):
         for x in range(box[2] // n, box[3] // n):
             i, j = y * n - box[0], x * n - box[2]
             ahead, cell = on_plane(rays, H, y, x, 0.5, 0.5, 1.0)
-            inside = area_inside(RECTANGLE, cell, 0.0, 0.0, rectangle) if ahead else 0.0
+            inside = area_inside(RECTANGLE, cell, 0.0, 0.0, rectangle, ends) if ahead else 0.0
             shade = 0.0
             if inside > 0:
                 texture = 0.0
@@ -96,7 +106,7 @@ def fill_face(
                     if 0 < inside < 1:
                         ahead, cell = on_plane(rays, H, y, x, (c + 0.5) / n, (r + 0.5) / n, 1.0 / n)
                         cover[i + r, j + c] = (
-                            area_inside(RECTANGLE, cell, 0.0, 0.0, rectangle) if ahead else 0.0
+                            area_inside(RECTANGLE, cell, 0.0, 0.0, rectangle, ends) if ahead else 0.0
                         )
 
 
@@ -129,13 +139,14 @@ def paint_mark(
         lamp: the light.
         n: cells along a pixel.
     """
+    ends = ends_of(shape)
     for row in range(part[0], part[1]):
         y = row // n
         fy = (row - y * n + 0.5) / n
         for column in range(part[2], part[3]):
             x = column // n
             ahead, cell = on_plane(rays, H, y, x, (column - x * n + 0.5) / n, fy, 1.0 / n)
-            area = area_inside(kind, cell, centre[0], centre[1], shape) if ahead else 0.0
+            area = area_inside(kind, cell, centre[0], centre[1], shape, ends) if ahead else 0.0
             if area > 0:
                 i, j = row - box[0], column - box[2]
                 value[i, j] += area * (mark * light_on(cell.a, cell.b, lamp) - value[i, j])
@@ -221,10 +232,10 @@ def interpolate(
 
 
 @compiled
-def area_inside(kind: int, cell: Cell, a0: float, b0: float, shape: FloatArray) -> float:
+def area_inside(kind: int, cell: Cell, a0: float, b0: float, shape: FloatArray, ends: Ends) -> float:
     """Return the fraction of a cell inside a mark, exact for edges that are straight in PARTS^2 parts."""
     a, b = cell.a - a0, cell.b - b0
-    f, fa, fb = distance_inside(kind, a, b, shape)
+    f, fa, fb = distance_inside(kind, a, b, shape, ends)
     gc, gr = fa * cell.a_column + fb * cell.b_column, fa * cell.a_row + fb * cell.b_row
     if abs(f) > abs(gc) + abs(gr):  # the edge is beyond the corners of the cell
         return 1.0 if f > 0 else 0.0
@@ -234,7 +245,7 @@ def area_inside(kind: int, cell: Cell, a0: float, b0: float, shape: FloatArray) 
             dr, dc = (i + 0.5) / PARTS - 0.5, (j + 0.5) / PARTS - 0.5
             a_part = a + dc * cell.a_column + dr * cell.a_row
             b_part = b + dc * cell.b_column + dr * cell.b_row
-            f, fa, fb = distance_inside(kind, a_part, b_part, shape)
+            f, fa, fb = distance_inside(kind, a_part, b_part, shape, ends)
             gc, gr = fa * cell.a_column + fb * cell.b_column, fa * cell.a_row + fb * cell.b_row
             area += half_plane(f, gc, gr, 1.0 / PARTS)
     return area / PARTS**2
@@ -264,7 +275,16 @@ def half_plane(f: float, gx: float, gy: float, side: float) -> float:
 
 
 @compiled
-def distance_inside(kind: int, a: float, b: float, shape: FloatArray) -> tuple[float, float, float]:
+def ends_of(shape: FloatArray) -> Ends:
+    """Return the directions of the ends of an arc or of a rectangle, whose angles are the last two values."""
+    start, end = shape[2], shape[2] + shape[3]
+    return Ends(math.cos(start), math.sin(start), math.cos(end), math.sin(end))
+
+
+@compiled
+def distance_inside(
+    kind: int, a: float, b: float, shape: FloatArray, ends: Ends
+) -> tuple[float, float, float]:
     """Return the distance inside a mark, object unit, at plane coordinates from its centre; its gradient."""
     if kind == DISC:
         radius = math.sqrt(a * a + b * b)
@@ -276,21 +296,20 @@ def distance_inside(kind: int, a: float, b: float, shape: FloatArray) -> tuple[f
         f, fa, fb = radius - shape[0], a / radius, b / radius
         if shape[1] - radius < f:
             f, fa, fb = shape[1] - radius, -a / radius, -b / radius
-        start, end = shape[2], shape[2] + shape[3]
         # Distances from the lines of both ends; an arc of more than half a circle is the union of both sides.
-        from_start = -math.sin(start) * a + math.cos(start) * b
-        from_end = math.sin(end) * a - math.cos(end) * b
+        from_start = -ends.sin_start * a + ends.cos_start * b
+        from_end = ends.sin_end * a - ends.cos_end * b
         first = from_start < from_end
         if shape[3] > math.pi:
             first = not first
         if first:
-            side, sa, sb = from_start, -math.sin(start), math.cos(start)
+            side, sa, sb = from_start, -ends.sin_start, ends.cos_start
         else:
-            side, sa, sb = from_end, math.sin(end), -math.cos(end)
+            side, sa, sb = from_end, ends.sin_end, -ends.cos_end
         if side < f:
             f, fa, fb = side, sa, sb
         return f, fa, fb
-    cos, sin = math.cos(shape[2]), math.sin(shape[2])
+    cos, sin = ends.cos_start, ends.sin_start
     x, y = cos * a + sin * b, -sin * a + cos * b
     fx, fy = shape[0] - abs(x), shape[1] - abs(y)
     if fx < fy:
