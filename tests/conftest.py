@@ -3,10 +3,12 @@
 from __future__ import annotations
 
 import atexit
+import gc
 import os
 import shutil
 import tempfile
 from collections import defaultdict
+from collections.abc import Generator
 from contextlib import nullcontext
 from math import prod
 from pathlib import Path
@@ -35,6 +37,20 @@ def pytest_sessionstart(session: pytest.Session) -> None:
         from sfm.cli.warm_up import main
 
         main()
+
+
+@pytest.hookimpl(wrapper=True)
+def pytest_collection() -> Generator[None, object, object]:
+    """Leave what is collected out of garbage collection, which took as long as the collection itself.
+
+    It all lives to the end: modules, compiled functions and 7,000 tests.
+    """
+    gc.disable()
+    try:
+        return (yield)
+    finally:
+        gc.freeze()
+        gc.enable()
 
 
 @pytest.hookimpl(tryfirst=True)
@@ -88,3 +104,11 @@ def no_plots(request: pytest.FixtureRequest, monkeypatch: pytest.MonkeyPatch) ->
     if "plots" not in request.fixturenames:
         monkeypatch.setattr("sfm.report.figures.plot_process.plot_process", lambda _: nullcontext())
         monkeypatch.setattr("sfm.report.output.draw_plots", lambda _: [])
+
+
+@pytest.fixture
+def in_process(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Run batches in this process: for tests of what they write, not of workers, which take 5 s to start."""
+    from tests.engines import HERE
+
+    monkeypatch.setattr("adapters.dask_cluster.local_engine", lambda *_, **__: HERE)

@@ -70,6 +70,7 @@ def test_a_draft_is_run_from_anywhere(
         photographs.chmod(0o755)
 
 
+@pytest.mark.usefixtures("in_process")
 def test_a_strangers_file_names_no_folder(
     rendered: Path, started: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
@@ -196,6 +197,7 @@ def test_a_batch_drafts_and_runs_folders_and_goes_on_after_a_kill(
     assert {path.name: path.stat().st_mtime_ns for path in Path("out/batch").glob("*.toml")} == first
 
 
+@pytest.mark.usefixtures("in_process")
 def test_masks_of_a_draft_are_found_beside_its_photographs(rendered: Path, started: Path) -> None:
     import cv2
     import numpy as np
@@ -213,6 +215,7 @@ def test_masks_of_a_draft_are_found_beside_its_photographs(rendered: Path, start
     assert single == batched and min(float(row["x_px"]) for row in single) > 200
 
 
+@pytest.mark.usefixtures("in_process")
 def test_a_video_that_cannot_be_read_is_refused_in_one_line(
     rendered: Path, started: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:

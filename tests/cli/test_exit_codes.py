@@ -149,6 +149,7 @@ def test_errors_of_kolinear_are_reported_as_they_are() -> None:
     assert error_in_words(caught.value) == "what was needed" and not hasattr(caught.value, "__notes__")
 
 
+@pytest.mark.usefixtures("in_process")
 @pytest.mark.parametrize(
     "place",
     [
@@ -177,7 +178,6 @@ def test_a_fault_in_one_survey_of_a_batch_fails_it_alone(
     monkeypatch.setattr(f"{module}.{name}", faulty)
     if name == "measure_photograph":  # as the survey itself does, once more
         monkeypatch.setattr("sfm.survey.measuring.targets.measure_photograph", faulty)
-    monkeypatch.setattr("adapters.dask_cluster.local_engine", lambda workers: HERE)
     out = tmp_path / "out"
     code, _ = run(capsys, "batch", first, second, "--out", out)
     assert code == 70

@@ -76,7 +76,7 @@ def test_pages_of_several_commands_are_printed(tmp_path: Path, capsys: pytest.Ca
     assert not (results[0] / "report.pdf").exists()  # it showed the earlier result
 
 
-@pytest.mark.usefixtures("browser", "plots")
+@pytest.mark.usefixtures("browser", "plots", "in_process")
 def test_a_batch_prints_its_reports_and_its_index(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     for name in ("first", "second"):
         write_observed_survey(tmp_path / name, name)

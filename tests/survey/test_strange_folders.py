@@ -51,12 +51,8 @@ from tests.synthetic import make_network, seed_of
 
 OWN = "the user's own text\n"
 SHELL = "x$(touch owned)"  # as the name of a survey: a line that a shell would run
+pytestmark = pytest.mark.usefixtures("in_process")
 Command = tuple[Callable[[Path], tuple[object, ...]], tuple[str, ...]]
-
-
-@pytest.fixture(autouse=True)
-def no_processes(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("adapters.dask_cluster.local_engine", lambda *_, **__: HERE)
 
 
 @pytest.fixture

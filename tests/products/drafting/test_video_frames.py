@@ -317,6 +317,7 @@ def test_init_writes_frames_beside_the_survey_file(tmp_path: Path) -> None:
     assert len(list((tmp_path / "b" / "own-frames").glob("*.jpg"))) == 3
 
 
+@pytest.mark.usefixtures("in_process")
 def test_two_videos_of_a_folder_are_two_cameras(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
