@@ -7,6 +7,7 @@ import subprocess
 import sys
 from collections.abc import Callable
 from contextlib import nullcontext
+from importlib import import_module
 from pathlib import Path
 from typing import Any, NoReturn
 
@@ -174,7 +175,7 @@ def test_a_fault_in_one_survey_of_a_batch_fails_it_alone(
         return maybe
 
     module, name = f"sfm.{place}".rsplit(".", 1)
-    faulty = fails(getattr(sys.modules[module], name))
+    faulty = fails(getattr(import_module(module), name))
     monkeypatch.setattr(f"{module}.{name}", faulty)
     if name == "measure_photograph":  # as the survey itself does, once more
         monkeypatch.setattr("sfm.survey.measuring.targets.measure_photograph", faulty)
