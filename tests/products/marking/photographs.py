@@ -19,10 +19,10 @@ Pattern = Callable[[AnyArray, AnyArray], AnyArray]
 def rendered(pattern: Pattern, rng: np.random.Generator, *, noise: float = 2.0) -> AnyArray:
     """Return a photograph of a pattern, which is 0 or 1 at (x, y) px, blurred and with noise, uint8."""
     fine = OVERSAMPLING
-    y, x = (np.mgrid[: SIDE * fine, : SIDE * fine] + 0.5) / fine - 0.5
-    sharp = pattern(x, y).astype(np.float32)
-    blurred = np.asarray(cv2.GaussianBlur(sharp, (0, 0), 0.8 * fine))
-    pixels = blurred.reshape(SIDE, fine, SIDE, fine).mean(axis=(1, 3))
+    at = (np.arange(SIDE * fine) + 0.5) / fine - 0.5
+    sharp = pattern(at[None], at[:, None]).astype(np.float32)
+    blurred = cv2.GaussianBlur(sharp, (0, 0), 0.8 * fine)
+    pixels = np.asarray(cv2.resize(blurred, (SIDE, SIDE), interpolation=cv2.INTER_AREA))
     grey = np.clip(np.rint(40 + 170 * pixels + rng.normal(0, noise, pixels.shape)), 0, 255).astype(np.uint8)
     return 255 - grey if rng.random() < 0.5 else grey
 
@@ -30,9 +30,10 @@ def rendered(pattern: Pattern, rng: np.random.Generator, *, noise: float = 2.0) 
 def turned(
     x: AnyArray, y: AnyArray, centre: FloatArray, angle: float, shear: float
 ) -> tuple[AnyArray, AnyArray]:
+    """Return the coordinates of a turned and sheared pattern at columns x, (1, w), and rows y, (h, 1)."""
     u, v = x - centre[0], y - centre[1]
     c, s = np.cos(angle), np.sin(angle)
-    return c * u + s * v + shear * (c * v - s * u), c * v - s * u
+    return (c - shear * s) * u + (s + shear * c) * v, c * v - s * u
 
 
 def pattern_of(kind: str, centre: FloatArray, rng: np.random.Generator) -> Pattern:
@@ -42,7 +43,7 @@ def pattern_of(kind: str, centre: FloatArray, rng: np.random.Generator) -> Patte
     def pattern(x: AnyArray, y: AnyArray) -> AnyArray:
         u, v = turned(x, y, centre, angle, shear)
         if kind == "target":
-            return np.hypot(u, v) < r
+            return u * u + v * v < r * r
         if kind == "saddle":
             return (np.floor(u / (2 * r)) + np.floor(v / (2 * r))) % 2 == 0
         if kind == "corner":

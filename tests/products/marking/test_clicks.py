@@ -2,11 +2,13 @@
 
 from __future__ import annotations
 
+from functools import cache
+
 import cv2
 import numpy as np
 import pytest
 
-from sfm.model.conventions import AnyArray
+from sfm.model.conventions import AnyArray, FloatArray
 from sfm.model.distributions import chi2_isf
 from sfm.model.errors import GeometryError
 from sfm.products.marking.clicks import Template, measure_click
@@ -18,17 +20,26 @@ LIMITS_PX = {"target": 0.05, "saddle": 0.05, "corner": 0.1, "cross": 0.1}
 FLAGGED_PX = 1.0
 
 
-def errors_of(kind: Kind, count: int, *, asked: Kind | None) -> tuple[list[float], list[float], int]:
-    """Return errors (px) of clicks, their squares over the covariance, and how many clicks failed."""
+@cache
+def clicked(kind: Kind, count: int) -> list[tuple[AnyArray, FloatArray, FloatArray]]:
+    """Return photographs of a feature, its place in each and a click beside it, px."""
     rng = np.random.default_rng(count)
-    errors: list[float] = []
-    squares: list[float] = []
-    refused = 0
+    clicks = []
     for _ in range(count):
         centre = (SIDE - 1) / 2 + rng.uniform(-0.5, 0.5, 2)
         photograph = rendered(pattern_of(kind, centre, rng), rng)
+        clicks.append((photograph, centre, click_beside(centre, rng)))
+    return clicks
+
+
+def errors_of(kind: Kind, count: int, *, asked: Kind | None) -> tuple[list[float], list[float], int]:
+    """Return errors (px) of clicks, their squares over the covariance, and how many clicks failed."""
+    errors: list[float] = []
+    squares: list[float] = []
+    refused = 0
+    for photograph, centre, click in clicked(kind, count):
         try:
-            measured = measure_click(photograph, *click_beside(centre, rng), asked)
+            measured = measure_click(photograph, *click, asked)
         except GeometryError:
             refused += 1
             continue
