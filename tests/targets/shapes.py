@@ -41,18 +41,21 @@ def polygon_coverage(corners: FloatArray, height: int, width: int) -> FloatArray
     the one it lies in by the trapezium to the right of it.
     """
     start, end = corners, np.roll(corners, -1, axis=0)
-    pieces = []
-    for p, q in zip(start, end, strict=True):
-        cuts = [np.array([0.0, 1.0])]
-        for axis in range(2):
-            low, high = sorted((p[axis], q[axis]))
-            lines = np.arange(math.floor(low) + 1, math.ceil(high))
-            if len(lines):
-                cuts.append((lines - p[axis]) / (q[axis] - p[axis]))
-        t = np.unique(np.concatenate(cuts))
-        points = p + t[:, None] * (q - p)
-        pieces.append(np.concatenate([points[:-1], points[1:]], axis=1))
-    x0, y0, x1, y1 = np.concatenate(pieces).T
+    low, high = np.minimum(start, end), np.maximum(start, end)
+    every = np.arange(len(corners))
+    edge, t = [every, every], [np.zeros(len(corners)), np.ones(len(corners))]
+    for axis in range(2):
+        first = np.floor(low[:, axis]) + 1
+        count = np.maximum(np.ceil(high[:, axis]) - first, 0).astype(int)
+        of = np.repeat(every, count)
+        line = first[of] + np.arange(len(of)) - np.repeat(np.cumsum(count) - count, count)
+        edge.append(of)
+        t.append((line - start[of, axis]) / (end - start)[of, axis])
+    of, cut = np.concatenate(edge), np.concatenate(t)
+    order = np.lexsort((cut, of))
+    of, cut = of[order], cut[order]
+    points = start[of] + cut[:, None] * (end - start)[of]
+    x0, y0, x1, y1 = np.concatenate([points[:-1], points[1:]], axis=1)[of[:-1] == of[1:]].T
     middle, dy = (x0 + x1) / 2, y1 - y0
     column = np.clip(np.floor(middle).astype(int), 0, width - 1)
     row = np.floor((y0 + y1) / 2).astype(int)

@@ -188,21 +188,23 @@ def test_bent_edges_do_not_move_crossings() -> None:
     """Edges of a curvature of 1/700 px, as a fisheye lens bends them, take 0.03 px in windows of 15 px."""
     rows, columns, side, finer = 6, 9, 50.0, 10
 
-    def flat(xy: FloatArray) -> FloatArray:
-        away = xy - (320, 240)
-        return away + away[..., ::-1] ** 2 / 1400
+    def flat(x: FloatArray, y: FloatArray) -> tuple[FloatArray, FloatArray]:
+        return x - 320 + (y - 240) ** 2 / 1400, y - 240 + (x - 320) ** 2 / 1400
 
-    y, x = (np.mgrid[: 480 * finer, : 640 * finer] + 0.5) / finer - 0.5
-    place = flat(np.stack([x, y], axis=-1)) / side + (columns / 2, rows / 2)
-    inside = ((place > -0.5) & (place < (columns + 0.5, rows + 0.5))).all(axis=-1)
-    dark = inside & (np.floor(place + 0.5).sum(axis=-1) % 2 == 0)
-    picture = cv2.resize(np.where(dark, 40.0, 210.0), (640, 480), interpolation=cv2.INTER_AREA)
+    x, y = ((np.arange(size * finer) + 0.5) / finer - 0.5 for size in (640, 480))
+    squares, inside = np.zeros((480 * finer, 640 * finer), np.int8), np.True_
+    for along, count in zip(flat(x[None], y[:, None]), (columns, rows), strict=True):
+        square = np.floor(along / side + (count / 2 + 0.5)).astype(np.int8)  # 0 is the border
+        inside = inside & (square >= 0) & (square <= count)
+        squares += square
+    dark = np.where(inside & (squares % 2 == 0), np.float32(40), np.float32(210))
+    picture = cv2.resize(dark, (640, 480), interpolation=cv2.INTER_AREA)
     picture = np.rint(cv2.GaussianBlur(picture, (0, 0), 1.0)).astype(np.uint8)
     row, column = np.mgrid[:rows, :columns]
     corners = side * (np.stack([column, row], axis=2).reshape(-1, 2) + 0.5 - (columns / 2, rows / 2))
     true = corners + np.array([320.0, 240.0])
     for _ in range(50):
-        true -= flat(true) - corners
+        true -= np.stack(flat(*true.T), axis=1) - corners
     board = PlateFamily("checkerboard", rows, columns)
     crossings, code = find_crossings(picture, board, scale=255.0, noise=0.3)
     assert len(code) == rows * columns
