@@ -9,7 +9,7 @@ import shutil
 import tempfile
 from collections import defaultdict
 from collections.abc import Generator
-from contextlib import nullcontext
+from contextlib import nullcontext, suppress
 from math import prod
 from pathlib import Path
 
@@ -19,7 +19,7 @@ os.environ.setdefault("OMP_NUM_THREADS", "1")
 import matplotlib
 import pytest
 
-from tests.places import SHARED
+from tests.places import ROOT, SHARED
 
 SHARED = SHARED / "data"
 
@@ -91,6 +91,22 @@ def shared_data() -> Path:
     if not SHARED.is_dir():
         pytest.skip("the public reference data ../shared/data are absent")
     return SHARED
+
+
+@pytest.fixture(scope="session")
+def demo_photographs(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Folder of the rendered photographs of the demo with their truth, of all processes: not to change."""
+    from sfm.products.rendering.render import write_photographs
+    from sfm.products.rendering.scene_file import read_scene
+
+    own = tmp_path_factory.getbasetemp()
+    shared = (own.parent if "PYTEST_XDIST_WORKER" in os.environ else own) / "demo-photographs"
+    if not shared.exists():
+        rendered = own / "rendered"
+        write_photographs(read_scene(ROOT / "datasets" / "demo" / "scene.toml"), rendered)
+        with suppress(OSError):  # another process was faster
+            rendered.rename(shared)
+    return shared
 
 
 @pytest.fixture

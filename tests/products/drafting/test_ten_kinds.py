@@ -20,12 +20,10 @@ from PIL import Image
 
 from sfm.model.camera import camera_from_values
 from sfm.photographs.reading import linearise_srgb
-from sfm.products.rendering.render import main as render
 from sfm.survey.inputs.survey_file import read_survey_file
 from tests.commands import kolinear
 from tests.photographs.test_camera_files import exif_of, write_dng, write_heic
 from tests.photographs.test_kinds_of_files import turned
-from tests.places import ROOT
 from tests.surveys import code_centres
 from tests.tables import rows_of
 from tests.videos import rendered, write_video
@@ -143,16 +141,6 @@ KINDS: dict[str, tuple[Maker, str, int]] = {
 }
 
 
-@pytest.fixture(scope="module")
-def source(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """The photographs of the demonstration."""
-    folder = tmp_path_factory.mktemp("rendered")
-    with pytest.MonkeyPatch.context() as patch:
-        patch.setattr("sys.argv", ["render", str(ROOT / "datasets" / "demo" / "scene.toml"), str(folder)])
-        render()
-    return folder
-
-
 def deviation(found: dict[str, np.ndarray], true: dict[str, np.ndarray]) -> float:
     """Return the RMS difference of distances between coded points, relative to their mean."""
     names = sorted(set(found) & set(true))
@@ -168,7 +156,7 @@ def deviation(found: dict[str, np.ndarray], true: dict[str, np.ndarray]) -> floa
 @pytest.mark.parametrize("kind", KINDS)
 def test_the_right_result_from_one_command(
     kind: str,
-    source: Path,
+    demo_photographs: Path,
     tmp_path: Path,
     monkeypatch: pytest.MonkeyPatch,
     capsys: pytest.CaptureFixture[str],
@@ -176,7 +164,7 @@ def test_the_right_result_from_one_command(
     make, name, cameras = KINDS[kind]
     monkeypatch.chdir(tmp_path)
     (tmp_path / kind).mkdir()
-    given = make(source, tmp_path / kind)
+    given = make(demo_photographs, tmp_path / kind)
     begun = time.perf_counter()
     code = kolinear("run", os.path.relpath(given))
     seconds = time.perf_counter() - begun
@@ -188,7 +176,7 @@ def test_the_right_result_from_one_command(
     if "vid" in kind:
         true = {str(code): place for code, place in code_centres().items()}
     else:
-        text = (source / "truth_points.csv").read_text(encoding="utf-8")
+        text = (demo_photographs / "truth_points.csv").read_text(encoding="utf-8")
         true = {
             row["code"]: np.array([float(row[axis]) for axis in "XYZ"])
             for row in csv.DictReader(io.StringIO(text))

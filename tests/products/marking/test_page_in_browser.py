@@ -21,8 +21,6 @@ from sfm.model.network import Network
 from sfm.model.similarity import fit_similarity
 from sfm.model.solution import Solution
 from sfm.products.marking.project import MarkedProject, project_of_survey
-from sfm.products.rendering.render import write_photographs
-from sfm.products.rendering.scene_file import read_scene
 from sfm.survey.inputs.marks_file import read_marks
 from sfm.survey.inputs.survey import read_survey
 from tests.browser import chromium
@@ -425,11 +423,9 @@ def test_the_page_is_readable(browser: Any, folder: Path, tmp_path: Path, scheme
 
 
 @pytest.fixture(scope="module")
-def demo(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, Targets]:
+def demo(demo_photographs: Path, tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, Targets]:
     """The survey of the demo without codes, and where its targets are."""
-    folder = tmp_path_factory.mktemp("demo")
-    write_photographs(read_scene(ROOT / "datasets" / "demo" / "scene.toml"), folder / "photographs")
-    return demo_survey(folder, folder / "photographs"), targets_of(folder / "photographs")
+    return demo_survey(tmp_path_factory.mktemp("demo"), demo_photographs), targets_of(demo_photographs)
 
 
 def normalised(xyz: FloatArray, sigma: FloatArray, truth: FloatArray) -> float:
