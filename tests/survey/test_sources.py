@@ -69,7 +69,8 @@ def write(folder: Path, more: str = "", codes: str = "ring14") -> Path:
     rng = seed_of("sources")
     for number, picture in enumerate(pictures(), 1):
         noisy = np.rint(picture + NOISE * rng.standard_normal(picture.shape))
-        cv2.imwrite(str(folder / f"photo {number}.png"), np.clip(noisy, 0, 255).astype(np.uint8))
+        grey = np.clip(noisy, 0, 255).astype(np.uint8)
+        cv2.imwrite(str(folder / f"photo {number}.png"), grey, [cv2.IMWRITE_PNG_COMPRESSION, 1])
     text = SURVEY.format(name="sources", backend="none").replace("ring14", codes)
     path = folder / "survey.toml"
     path.write_text(text + more, "utf-8")
