@@ -128,7 +128,7 @@ class Reference:
                 triplets.append(np.broadcast_arrays(derivatives, row, columns[:, None, :]))
             parts = np.array([kind.part_of(row, a) for row in range(n) for a in range(d)], dtype=np.int64)
             v.append(-linear.difference.ravel())
-            stated += list(covariance)
+            stated.append((row[:, :, 0], covariance))
             motions.append(A.reshape(n * d, 7))
             basis = np.zeros((n * d, 0))
             if linear.taken is not None:  # of the columns of the cofactors of its own parameters
@@ -142,7 +142,9 @@ class Reference:
             np.concatenate([triplet[k].ravel() for triplet in triplets]) for k in range(3)
         )
         J = csr_matrix((data, (row_of, column_of)), shape=(rows, len(self.C)))
-        S = block_diag(*stated)
+        S = np.zeros((rows, rows))
+        for at, covariance in stated:
+            S[at[:, :, None], at[:, None]] = covariance
         on = np.isfinite(np.diagonal(S))
         A = np.hstack([np.concatenate(motions), block_diag(*own)])[on]
         kept, items = np.concatenate(item)[on], np.array(of, dtype=np.int64)
