@@ -87,7 +87,7 @@ def run_survey_file(survey_file: Path, options: RunOptions) -> Path:
             write_result,
         )
         from sfm.runtime.forecast import Run, RunHistory, announced, expected_seconds
-        from sfm.runtime.memory import peak_mb
+        from sfm.runtime.memory import peak_bytes
         from sfm.runtime.progress_bar import drawn_progress
         from sfm.runtime.threads import cores, one_blas_thread
         from sfm.survey.inputs.calibration import Calibration, read_calibrations
@@ -189,7 +189,7 @@ def run_survey_file(survey_file: Path, options: RunOptions) -> Path:
             plot_process=plots,
         )
         if not revised and (store is None or not store.has_earlier):
-            history.add(Run(work, drawn.finished(), peak_mb()))
+            history.add(Run(work, drawn.finished(), peak_bytes() / 1e6))
     seconds = time.perf_counter() - begun
     if options.product is not None:
         dependable = options.product.show(folder, pdf=options.pdf)

@@ -16,7 +16,7 @@ from pathlib import Path
 from sfm.files.user_cache import make_user_folder, user_folder
 from sfm.files.whole_files import whole_file
 from sfm.model.errors import KolinearError, OutputError
-from sfm.runtime.memory import available_mb
+from sfm.runtime.memory import left_bytes
 
 KEPT_RUNS = 200
 OTHERS_APART = math.log(8.0)  # a run of the user is preferred to a typical one eight times nearer in size
@@ -161,7 +161,7 @@ def announced(work: Work, runs: Sequence[Run]) -> str:
     Raises:
         KolinearError: it needs much more memory than there is.
     """
-    memory, there = expected_memory_mb(work, runs), available_mb()
+    memory, there = expected_memory_mb(work, runs), left_bytes() / 1e6
     if memory > MEMORY_MARGIN * there:
         raise KolinearError(
             f"the survey needs about {memory / 1000:.1f} GB of memory, and {there / 1000:.1f} GB are free: "

@@ -23,6 +23,7 @@ from sfm.adjustment.engine.unknowns import Unknowns, unknowns_of
 from sfm.model.errors import GeometryError
 from sfm.model.estimate import Estimate
 from sfm.model.network import ImagePoints, Network
+from sfm.runtime import memory as system
 from sfm.runtime.threads import own_threads
 from tests.adjustment.test_null_space import halves, in_fronts, together
 from tests.synthetic import make_network, seed_of
@@ -89,7 +90,7 @@ def test_a_container_may_have_less_memory_than_the_computer(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     limit = tmp_path / "memory.max"
-    monkeypatch.setattr(memory, "LIMITS", (tmp_path / "missing", limit))
+    monkeypatch.setattr(system, "LIMITS", ((tmp_path / "missing", limit), (limit, tmp_path / "used")))
     whole = memory.available_bytes()
     for said, expected in (("max\n", whole), ("2000000\n", memory.SHARE * 2e6), (f"{2**63}\n", whole)):
         limit.write_text(said, encoding="ascii")

@@ -161,9 +161,9 @@ def test_a_long_survey_is_announced_and_one_without_room_refused(monkeypatch: py
     assert announced(Work(("unheard of",), 10), [SMALL]) == ""
     long = Run(Work(("targets",), 500, 1.0), {"targets": 0.4, "adjustment": 7000.0, "report": 130.0}, 6600.0)
     expected = "expected: 2.0 h (adjustment 1.9 h, report 2 min) and 6.6 GB of memory"
-    monkeypatch.setattr(forecast, "available_mb", lambda: 6000.0)
+    monkeypatch.setattr(forecast, "left_bytes", lambda: 6e9)
     assert announced(long.work, [long]) == expected
-    monkeypatch.setattr(forecast, "available_mb", lambda: 5000.0)
+    monkeypatch.setattr(forecast, "left_bytes", lambda: 5e9)
     with pytest.raises(KolinearError, match=r"needs about 6\.6 GB of memory, and 5\.0 GB are free"):
         announced(long.work, [long])
 

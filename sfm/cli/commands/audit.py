@@ -79,7 +79,7 @@ def audit(
         )
         from sfm.report.pages import page_of, texts_of
         from sfm.runtime.forecast import Run, RunHistory, announced, expected_seconds
-        from sfm.runtime.memory import peak_mb
+        from sfm.runtime.memory import peak_bytes
         from sfm.runtime.progress_bar import drawn_progress
         from sfm.runtime.threads import cores, one_blas_thread
         from sfm.survey.inputs.measurements import NO_PHOTOGRAPHS, work_of
@@ -126,7 +126,7 @@ def audit(
             log.close_into(part, findings)
 
         write_result(findings, folder, finish=finish, progress=log)
-        history.add(Run(work, drawn.finished(), peak_mb()))
+        history.add(Run(work, drawn.finished(), peak_bytes() / 1e6))
     print_verdict(page.verdict)
     for note in (*notes, *judged.like):
         print(f"{model}: {note}")

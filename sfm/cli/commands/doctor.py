@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-import os
+import math
 import platform
 import shutil
 import time
@@ -109,6 +109,7 @@ def doctor() -> None:
 
         from sfm.files.user_cache import user_folder
         from sfm.runtime.compiling import KEPT
+        from sfm.runtime.memory import limit_bytes
         from sfm.runtime.threads import cores
         from sfm.runtime.warmed import is_warm
 
@@ -118,10 +119,8 @@ def doctor() -> None:
     for name in LIBRARIES:
         table.add_row(name, _version(name))
     table.add_row("cores", str(cores()))
-    memory = "unknown"
-    if hasattr(os, "sysconf") and "SC_PHYS_PAGES" in os.sysconf_names:
-        memory = f"{os.sysconf('SC_PHYS_PAGES') * os.sysconf('SC_PAGE_SIZE') / 2**30:.1f} GiB"
-    table.add_row("memory", memory)
+    memory = limit_bytes()
+    table.add_row("memory", f"{memory / 2**30:.1f} GiB" if math.isfinite(memory) else "unknown")
     table.add_row(
         "browser", next((name for name in BROWSERS if shutil.which(name)), "none found by its name")
     )

@@ -6,23 +6,17 @@ the step and, at the optimum, the elements of S^-1 that covariances need.
 
 from __future__ import annotations
 
-import os
+import math
 from dataclasses import dataclass
-from pathlib import Path
 from typing import Any, Protocol
 
 from sfm.adjustment.datum import Motions
 from sfm.model.conventions import FloatArray
 from sfm.model.errors import GeometryError
+from sfm.runtime.memory import limit_bytes
 
-try:
-    import resource
-except ImportError:  # Windows
-    resource = None  # type: ignore[assignment]
 SHARE = 0.75  # share of the memory; the network, its blocks and other programs need the rest
 UNKNOWN = 8e9  # bytes assumed if the system does not state its memory
-# Memory limits of containers, in bytes (control groups of versions 2 and 1); processes above them are ended
-LIMITS = (Path("/sys/fs/cgroup/memory.max"), Path("/sys/fs/cgroup/memory/memory.limit_in_bytes"))
 
 
 @dataclass(frozen=True)
@@ -83,19 +77,8 @@ class Solver(Protocol):
 
 def available_bytes() -> float:
     """Return the memory that normal equations may use, bytes."""
-    known = UNKNOWN
-    if hasattr(os, "sysconf") and "SC_PHYS_PAGES" in os.sysconf_names:
-        known = float(os.sysconf("SC_PHYS_PAGES") * os.sysconf("SC_PAGE_SIZE"))
-    for file in LIMITS:
-        try:
-            known = min(known, float(file.read_text(encoding="ascii")))
-        except (OSError, ValueError):  # the file does not exist, or contains "max"
-            continue
-    if resource is not None:  # ulimit -v
-        limit = resource.getrlimit(resource.RLIMIT_AS)[0]
-        if limit != resource.RLIM_INFINITY:
-            known = min(known, float(limit))
-    return SHARE * known
+    known = limit_bytes()
+    return SHARE * (known if math.isfinite(known) else UNKNOWN)
 
 
 def refuse_what_does_not_fit(size: float, unknowns: str, *, limit: float) -> None:
