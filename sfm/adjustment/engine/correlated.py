@@ -21,6 +21,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 from dataclasses import dataclass, replace
+from typing import NamedTuple
 
 import numpy as np
 from scipy.sparse import bsr_matrix, csc_matrix, csr_matrix
@@ -41,7 +42,7 @@ from sfm.adjustment.result import Covariance, ErrorCorrelation
 from sfm.model.conventions import BoolArray, FloatArray, IntArray
 from sfm.model.network import rows_of
 from sfm.model.observations.pose import exterior_jacobian
-from sfm.runtime.compiling import kernel
+from sfm.runtime.compiling import compiled, kernel
 
 POINTS_AT_ONCE = 2000
 BYTES_AT_ONCE = 16_000_000  # bytes of the correlations held at a time
@@ -55,6 +56,9 @@ class Linearised:
     factor: Factor
     A: csr_matrix  # derivatives by reduced unknowns, (2k, reduced)
     B: csr_matrix  # derivatives by eliminated points, (2k, 3n)
+    by_cameras: FloatArray  # derivatives by the pose and the free parameters of the camera, (k, 2, 6 + f)
+    by_points: FloatArray  # derivatives by each object point, eliminated or kept, (k, 2, 3)
+    column: IntArray  # reduced unknowns of the former in each photograph, (m, 6 + f)
     V_inverse: csr_matrix  # V^-1 of the eliminated points, (3n, 3n)
     by_ray: FloatArray  # B V^-1, d X / d errors of each ray with fixed cameras; 0 for kept points, (k, 2, 3)
     whitening: FloatArray  # F of each image point with F'F its weight, 1/px, (k, 2, 2)
@@ -107,19 +111,6 @@ class Influence:
             Z[rays, :, place[point[rays]] + axis] += self.linear.by_ray[rays, :, axis]
         return Z
 
-    def scores_of(self, rows: IntArray) -> tuple[IntArray, FloatArray]:
-        """Return the columns of `unknowns` that image points affect, and their scores, (k, 2, columns).
-
-        Scores are the derivatives, by errors, of the right-hand side of the reduced normal equations and the
-        datum. Scores of all image points would take more memory than the rest of the adjustment.
-        """
-        xy_rows = (2 * rows[:, None] + np.arange(2)).ravel()
-        scores, reduced = self.linear.A[xy_rows] - self.linear.B[xy_rows] @ self.through.T, len(self.H)
-        touched = np.flatnonzero(np.bincount(scores.indices, minlength=reduced))
-        S = scores[:, touched].toarray().reshape(len(rows), 2, len(touched))
-        columns = np.concatenate([touched, np.arange(reduced, len(self.unknowns))])
-        return columns, np.concatenate([S, self._scores_of_datum(rows)], axis=2)
-
     def _scores_of_datum(self, rows: IntArray) -> FloatArray:
         """Return the derivatives of the datum parameters by the errors of some image points, (k, 2, d)."""
         return self.linear.by_ray[rows] @ self.of_datum[self.linear.layout.observations.point[rows]]
@@ -162,14 +153,114 @@ def influence_of(optimum: Optimum, layout: Unknowns, weight: FloatArray) -> Infl
     )
 
 
+class _Errors(NamedTuple):
+    """Image points with correlated errors, photograph by photograph, in the form that compiled code uses."""
+
+    first: IntArray  # first image point of each photograph, and the end, (m + 1,)
+    image: IntArray  # photograph of each image point, (k,)
+    point: IntArray  # object point of each image point, (k,)
+    of_point: IntArray  # image points, object point by object point, (k,)
+    first_of_point: IntArray  # first of these of each object point, and the end, (n + 1,)
+    xy: FloatArray  # px, (k, 2)
+    by_cameras: FloatArray  # whitened derivatives by pose and camera, times whitening, 1/px, (k, 2, 6 + f)
+    by_points: FloatArray  # the same by the object point, (k, 2, 3)
+    alone: FloatArray  # covariance that each image point has with no other, px^2, (k, 2, 2)
+
+
+@dataclass(frozen=True)
+class _OfPoints:
+    """Covariances by R - I of the right-hand sides B'e of some object points."""
+
+    others: IntArray  # points in their photographs, sorted, (c,)
+    columns: IntArray  # scores that their photographs affect, (s,)
+    with_points: FloatArray  # with B'e of these points, (3 p, 3 c)
+    direct: FloatArray  # with A'e, of which the scores are A'e - W V^-1 B'e, (3 p, s)
+    indirect: FloatArray  # with W V^-1 B'e, (3 p, s)
+    through: FloatArray  # the columns of W V^-1 that belong to the points themselves, transposed, (3 p, s)
+
+    @property
+    def with_scores(self) -> FloatArray:
+        """The covariances with the scores, (3 p, s)."""
+        return self.direct - self.indirect
+
+
+@dataclass(frozen=True)
+class _ErrorsInCommon:
+    """R - I of all photographs, and where its sums belong."""
+
+    influence: Influence
+    correlation: ErrorCorrelation
+    errors: _Errors
+    column: IntArray  # reduced unknowns of the pose and the camera of each photograph, (m, 6 + f)
+    shows: csr_matrix  # which photographs show each point with such errors, (n, m)
+    inverse: FloatArray  # V^-1 of each point, 0 for kept points, (n, 3, 3)
+
+    def parts(self, points: IntArray) -> Iterator[IntArray]:
+        """Yield points in parts whose covariances take no more memory than the derivatives do.
+
+        The points of a part are in the same photographs, as far as possible; those without errors in common
+        are in no part.
+        """
+        errors = self.errors
+        seen = points[np.diff(errors.first_of_point)[points] > 0]
+        first = errors.image[errors.of_point[errors.first_of_point[seen]]]
+        left = [seen[np.argsort(first, kind="stable")]] if len(seen) else []
+        while left:
+            part = left.pop()
+            if len(part) > 1 and 9 * len(part) * len(self._beside(part)) > errors.by_cameras.size:
+                left += np.array_split(part, 2)
+            else:
+                yield part
+
+    def no_cameras(self) -> FloatArray:
+        """Return zeros for the covariances of A'e of each photograph, (m, 6 + f, 6 + f)."""
+        m, unknowns = self.column.shape
+        return np.zeros((m, unknowns, unknowns))
+
+    def _beside(self, points: IntArray) -> IntArray:
+        """Return the points in all photographs that show some points, sorted, (c,)."""
+        first = self.errors.first
+        images = np.unique(self.shows[points].indices)
+        return np.unique(np.concatenate([self.errors.point[first[i] : first[i + 1]] for i in images]))
+
+    def of_points(self, points: IntArray, cameras: FloatArray) -> _OfPoints:
+        """Return the covariances of the right-hand sides of some points.
+
+        Args:
+            points: the points, (p,).
+            cameras: covariances of A'e of each photograph, (m, 6 + f, 6 + f); their shares are added.
+        """
+        influence, others = self.influence, self._beside(points)
+        n, reduced = len(self.inverse), len(influence.H)
+        shown = influence.through[:, (3 * others[:, None] + np.arange(3)).ravel()]
+        columns = np.union1d(shown.indices, self.column[np.unique(self.shows[points].indices)])
+        place, place_of_point = np.zeros(reduced, dtype=np.int64), np.zeros(n, dtype=np.int64)
+        place[columns], place_of_point[others] = np.arange(len(columns)), np.arange(len(others))
+        of_reduced = csr_matrix(
+            (shown.data, place[shown.indices], shown.indptr), shape=(3 * len(others), len(columns))
+        )
+        of_datum = self.inverse[others] @ influence.of_datum[others]
+        d = of_datum.shape[2]
+        through = np.hstack([of_reduced.toarray(), -of_datum.reshape(3 * len(others), d)])
+        with_points = np.zeros((3 * len(points), 3 * len(others)))
+        with_cameras = np.zeros((3 * len(points), through.shape[1]))
+        _add_pairs(
+            self.errors,
+            (points, place_of_point, place[self.column]),
+            (float(self.correlation.common), float(self.correlation.length_px)),
+            (with_points, with_cameras, cameras),
+        )
+        own = (3 * place_of_point[points][:, None] + np.arange(3)).ravel()
+        columns = np.concatenate([columns, np.arange(reduced, reduced + d)])
+        return _OfPoints(others, columns, with_points, with_cameras, with_points @ through, through[own])
+
+
 @dataclass(frozen=True)
 class CorrelatedPart:
     """Cofactors due to the correlation of the errors, in the datum of the influence."""
 
     influence: Influence
-    correlation: ErrorCorrelation
-    relative: FloatArray  # whitening of each image point relative to a usual one, (k, 2, 2)
-    which: BoolArray  # image points with correlated errors, (k,)
+    in_common: _ErrorsInCommon
     middle: FloatArray  # S'(R - I) S of the scores S, (reduced + d, reduced + d)
     points: FloatArray  # covariance of each object point, (n, 3, 3)
     limiting: FloatArray  # the same with photographs and cameras held fixed, (n, 3, 3)
@@ -182,23 +273,19 @@ class CorrelatedPart:
             [influence.of_reduced()[:, unknowns], influence.of_points(coordinates)]
         )
         added = C.T @ self.middle @ C
-        if not p:
-            return np.asarray(added)
-        o, by_ray = influence.linear.layout.observations, influence.linear.by_ray
         place = np.full(len(self.points), -1)
         place[points] = np.arange(p)
-        of_all = np.zeros((3 * p, C.shape[1]))
-        for photograph in _photographs(o.image, o.xy, self.relative, self.correlation, self.which):
-            rows = photograph.rows
-            chosen = np.flatnonzero(place[o.point[rows]] >= 0)
-            if not len(chosen):
-                continue
-            columns, S = influence.scores_of(rows)
-            O, at = by_ray[rows[chosen]], place[o.point[rows[chosen]]]
-            lines = (3 * at[:, None] + np.arange(3)).ravel()
-            KS = photograph.times(S, chosen)
-            of_all[lines] += (O.transpose(0, 2, 1) @ KS).reshape(len(lines), -1) @ C[columns]
-            photograph.add_between(added, u + 3 * at, O, chosen)
+        of_all, inverse = np.zeros((3 * p, C.shape[1])), self.in_common.inverse
+        cameras = self.in_common.no_cameras()
+        for part in self.in_common.parts(np.asarray(points)):
+            of = self.in_common.of_points(part, cameras)
+            rows = (3 * place[part][:, None] + np.arange(3)).ravel()
+            of_all[rows] = _times(inverse[part], of.with_scores @ C[of.columns])
+            asked = np.flatnonzero(place[of.others] >= 0)
+            columns = (3 * place[of.others[asked]][:, None] + np.arange(3)).ravel()
+            between = of.with_points[:, (3 * asked[:, None] + np.arange(3)).ravel()]
+            between = _times(inverse[of.others[asked]], _times(inverse[part], between).T).T
+            added[np.ix_(u + rows, u + columns)] += between
         added[u:] += of_all
         added[:, u:] += of_all.T
         return np.asarray(added)
@@ -236,27 +323,129 @@ def correlated_part(
         usual_px: a priori standard deviation of a usual image coordinate, px.
         which: image points with correlated errors, (k,).
     """
-    linear, r = influence.linear, len(influence.unknowns)
-    relative = usual_px * linear.whitening
-    o, n = linear.layout.observations, len(linear.layout.point_free)
+    in_common = _errors_in_common(influence, correlation, usual_px, which)
+    inverse, r = in_common.inverse, len(influence.unknowns)
+    n = len(inverse)
     middle, added, limiting = np.zeros((r, r)), np.zeros((n, 3, 3)), np.zeros((n, 3, 3))
-    for photograph in _photographs(o.image, o.xy, relative, correlation, which):
-        rows = photograph.rows
-        columns, S = influence.scores_of(rows)
-        KS = photograph.times(S)
-        middle[np.ix_(columns, columns)] += np.tensordot(S, KS, axes=((0, 1), (0, 1)))
-        j, by_ray = o.point[rows], linear.by_ray[rows].transpose(0, 2, 1)
-        right = influence.unknowns[columns] @ influence.of_points((3 * j[:, None] + np.arange(3)).ravel())
-        half = by_ray @ (KS @ right.reshape(len(columns), len(rows), 3).transpose(1, 0, 2))
-        alone = by_ray @ photograph.variances() @ by_ray.transpose(0, 2, 1)
-        np.add.at(limiting, j, alone)
-        np.add.at(added, j, half + half.transpose(0, 2, 1) + alone)
+    cameras = in_common.no_cameras()
+    for points in in_common.parts(np.arange(n)):
+        of = in_common.of_points(points, cameras)
+        half = of.through.T @ (of.direct - of.indirect / 2)
+        middle[np.ix_(of.columns, of.columns)] -= half + half.T
+        at = 3 * np.searchsorted(of.others, points)[:, None] + np.arange(3)
+        alone = of.with_points.reshape(-1, 3, of.with_points.shape[1])
+        alone = inverse[points] @ np.take_along_axis(alone, at[:, None], axis=2) @ inverse[points]
+        right = influence.unknowns[of.columns] @ influence.of_points(
+            (3 * points[:, None] + np.arange(3)).ravel()
+        )
+        scores = _times(inverse[points], of.with_scores).reshape(len(points), 3, -1)
+        half = np.einsum("pas,spb->pab", scores, right.reshape(-1, len(points), 3), optimize=True)
+        limiting[points] = alone
+        added[points] = half + half.transpose(0, 2, 1) + alone
+    column = in_common.column
+    np.add.at(middle, (column[:, :, None], column[:, None]), cameras)
     D = influence.unknowns.T @ middle @ influence.unknowns
     for first in range(0, n, POINTS_AT_ONCE):
         C = influence.of_points(np.arange(3 * first, min(3 * (first + POINTS_AT_ONCE), 3 * n)))
         through = np.einsum("rpa,rpb->pab", C.reshape(r, -1, 3), (D @ C).reshape(r, -1, 3))
         added[first : first + POINTS_AT_ONCE] += through
-    return CorrelatedPart(influence, correlation, relative, which, middle, added, limiting)
+    return CorrelatedPart(influence, in_common, middle, added, limiting)
+
+
+def _errors_in_common(
+    influence: Influence, correlation: ErrorCorrelation, usual_px: float, which: BoolArray
+) -> _ErrorsInCommon:
+    """Return R - I of all photographs, see `correlated_part`."""
+    linear = influence.linear
+    layout, o = linear.layout, linear.layout.observations
+    m, n = len(o.camera), len(layout.point_free)
+    used = which & (np.linalg.det(linear.whitening) > 0)  # others have no weight
+    rows = np.flatnonzero(used)
+    rows = rows[np.argsort(o.image[rows], kind="stable")]
+    image, point = o.image[rows], o.point[rows]
+    whitening = np.swapaxes(usual_px * linear.whitening[rows], 1, 2)
+    unwhitened = np.linalg.inv(whitening)
+    errors = _Errors(
+        np.searchsorted(image, np.arange(m + 1)),
+        image,
+        point,
+        np.argsort(point, kind="stable"),
+        np.searchsorted(np.sort(point), np.arange(n + 1)),
+        o.xy[rows],
+        whitening @ linear.by_cameras[rows],
+        whitening @ linear.by_points[rows],
+        (correlation.alone - 1.0) * np.swapaxes(unwhitened, 1, 2) @ unwhitened,
+    )
+    inverse = linear.V_inverse.data.reshape(n, 3, 3).copy()  # its only blocks are on the diagonal
+    inverse[layout.kept] = 0.0
+    shows = csr_matrix((np.ones(len(rows), dtype=np.int8), (point, image)), shape=(n, m))
+    return _ErrorsInCommon(influence, correlation, errors, linear.column, shows, inverse)
+
+
+def _times(blocks: FloatArray, values: FloatArray) -> FloatArray:
+    """Return the product of a block-diagonal matrix, blocks (p, 3, 3), and a matrix (3 p, q)."""
+    return np.asarray((blocks @ values.reshape(len(blocks), 3, -1)).reshape(values.shape))
+
+
+@compiled
+def _add_pairs(
+    errors: _Errors,
+    places: tuple[IntArray, IntArray, IntArray],
+    covariance: tuple[float, float],
+    sums: tuple[FloatArray, FloatArray, FloatArray],
+) -> None:
+    """Add the covariances of all pairs of image points of a photograph, one of them of some points.
+
+    Args:
+        errors: image points.
+        places: the points, (p,); the column of each point, divided by 3, (n,); the columns of pose and camera
+            of each photograph, (m, 6 + f).
+        covariance: variance of the error in common, px^2 relative to a usual one, and correlation length, px.
+        sums: covariances of B'e of the points with that of others, (3 p, 3 c), and with A'e, (3 p, s); and of
+            A'e of each photograph with itself, (m, 6 + f, 6 + f).
+    """
+    points, place, column = places
+    common, length_px = covariance
+    with_points, with_cameras, cameras = sums
+    unknowns = column.shape[1]
+    moved = np.empty((2, unknowns))
+    for p in range(len(points)):
+        for at in range(errors.first_of_point[points[p]], errors.first_of_point[points[p] + 1]):
+            a = errors.of_point[at]
+            i = errors.image[a]
+            B = errors.by_points[a]
+            moved[:] = 0.0
+            for b in range(errors.first[i], errors.first[i + 1]):
+                dx, dy = errors.xy[a, 0] - errors.xy[b, 0], errors.xy[a, 1] - errors.xy[b, 1]
+                shared = common * np.exp(-np.sqrt(dx * dx + dy * dy) / length_px)
+                first = 3 * place[errors.point[b]]
+                for c in range(unknowns):
+                    moved[0, c] += shared * errors.by_cameras[b, 0, c]
+                    moved[1, c] += shared * errors.by_cameras[b, 1, c]
+                for x in range(3):
+                    from_x, from_y = shared * B[0, x], shared * B[1, x]
+                    for y in range(3):
+                        with_points[3 * p + x, first + y] += (
+                            from_x * errors.by_points[b, 0, y] + from_y * errors.by_points[b, 1, y]
+                        )
+            own, O = 3 * place[points[p]], errors.alone[a]
+            for x in range(3):
+                from_x = B[0, x] * O[0, 0] + B[1, x] * O[1, 0]
+                from_y = B[0, x] * O[0, 1] + B[1, x] * O[1, 1]
+                for y in range(3):
+                    with_points[3 * p + x, own + y] += from_x * B[0, y] + from_y * B[1, y]
+            for c in range(unknowns):
+                for row in range(2):
+                    moved[row, c] += (
+                        O[row, 0] * errors.by_cameras[a, 0, c] + O[row, 1] * errors.by_cameras[a, 1, c]
+                    )
+            for c in range(unknowns):
+                for x in range(3):
+                    with_cameras[3 * p + x, column[i, c]] += B[0, x] * moved[0, c] + B[1, x] * moved[1, c]
+                for q in range(unknowns):
+                    cameras[i, q, c] += (
+                        errors.by_cameras[a, 0, q] * moved[0, c] + errors.by_cameras[a, 1, q] * moved[1, c]
+                    )
 
 
 def correlated_sum(
@@ -293,67 +482,20 @@ class _Photograph:
     relative: FloatArray  # G, (r, 2, 2)
     correlation: ErrorCorrelation
 
-    def times(self, Z: FloatArray, rows: IntArray | None = None) -> FloatArray:
-        """Return (R - I) Z of some image points, (s, 2, u), from Z (r, 2, u); C is formed in parts."""
-        rows = np.arange(len(self.rows)) if rows is None else rows
+    def times(self, Z: FloatArray) -> FloatArray:
+        """Return (R - I) Z of all image points from Z, both (r, 2, u); C is formed in parts."""
         of_shift = (np.swapaxes(self.relative, 1, 2) @ Z).reshape(len(Z), -1)
-        parts = np.array_split(rows, 1 + 8 * len(rows) * len(self.xy) // BYTES_AT_ONCE)
-        moved = np.concatenate([self.common(part, slice(None)) @ of_shift for part in parts])
-        moved = moved.reshape(len(rows), *Z.shape[1:])
-        return np.asarray((self.correlation.alone - 1.0) * Z[rows] + self.relative[rows] @ moved)
+        parts = np.array_split(np.arange(len(Z)), 1 + 8 * len(Z) ** 2 // BYTES_AT_ONCE)
+        moved = np.concatenate([self.common(part) @ of_shift for part in parts]).reshape(Z.shape)
+        return np.asarray((self.correlation.alone - 1.0) * Z + self.relative @ moved)
 
-    def add_between(self, added: FloatArray, first: IntArray, O: FloatArray, rows: IntArray) -> None:
-        """Add O'(R - I) O for functions O of some image points, three each (s, 2, 3).
-
-        Args:
-            added: a matrix, changed.
-            first: its first row for each image point, (s,).
-            O: derivatives of the functions by the errors, (s, 2, 3).
-            rows: image points, (s,).
-        """
-        of_shift = np.swapaxes(self.relative[rows], 1, 2) @ O
-        alone = (self.correlation.alone - 1.0) * np.swapaxes(O, 1, 2) @ O
-        xy, of_shift = np.ascontiguousarray(self.xy[rows]), np.ascontiguousarray(of_shift)
-        common, length_px = float(self.correlation.common), float(self.correlation.length_px)
-        _add_between(added, first, xy, of_shift, alone, common, length_px)
-
-    def variances(self) -> FloatArray:
-        """Return the diagonal blocks of R - I, one per image point, (r, 2, 2)."""
-        together = self.correlation.common * self.relative @ np.swapaxes(self.relative, 1, 2)
-        return np.asarray((self.correlation.alone - 1.0) * np.eye(2) + together)
-
-    def common(self, rows: IntArray, others: IntArray | slice) -> FloatArray:
-        """Return C between some image points and others, (s, o)."""
-        C = cdist(self.xy[rows], self.xy[others])
+    def common(self, rows: IntArray) -> FloatArray:
+        """Return C between some image points and all, (s, r)."""
+        C = cdist(self.xy[rows], self.xy)
         C /= -self.correlation.length_px
         np.exp(C, out=C)
         C *= self.correlation.common
         return np.asarray(C)
-
-
-@kernel
-def _add_between(
-    added: FloatArray,
-    first: IntArray,
-    xy: FloatArray,
-    of_shift: FloatArray,
-    alone: FloatArray,
-    common: float,
-    length_px: float,
-) -> None:
-    """Add the covariances of three functions each of all pairs of image points of a photograph."""
-    for a in range(len(first)):
-        for b in range(a + 1):
-            distance = np.hypot(xy[a, 0] - xy[b, 0], xy[a, 1] - xy[b, 1])
-            shared = common * np.exp(-distance / length_px)
-            for x in range(3):
-                for y in range(3):
-                    both = of_shift[a, 0, x] * of_shift[b, 0, y] + of_shift[a, 1, x] * of_shift[b, 1, y]
-                    if a == b:
-                        added[first[a] + x, first[a] + y] += shared * both + alone[a, x, y]
-                    else:
-                        added[first[a] + x, first[b] + y] += shared * both
-                        added[first[b] + y, first[a] + x] += shared * both
 
 
 def _photographs(
@@ -398,6 +540,9 @@ def linearise(optimum: Optimum, layout: Unknowns, weight: FloatArray) -> Lineari
         optimum.factor,
         by_cameras + by_kept if kept.any() else by_cameras,
         _of_rays(B[~kept], of_point, ~kept, 3 * n),
+        A,
+        B,
+        np.concatenate([6 * o.pose_of[:, None] + np.arange(6), o.free_column[o.camera, :f]], axis=1),
         csr_matrix(bsr_matrix((V_inverse, np.arange(n), np.arange(n + 1)))),
         np.where(kept[:, None, None], 0.0, B) @ V_inverse[o.point],
         F,
