@@ -163,11 +163,11 @@ def _orient_with_best_c(
     given = survey.start_orientations is not None or survey.start_points is not None
 
     exact = all(source.is_exact for source in network.sources)
-    orient_from = partial(_orient_on_control, measured, network, given=exact)
+    orient_from = partial(_orient_on_control, measured, given=exact)
 
     orientation, failure = None, None
     try:
-        orientation = orient_from(estimate)
+        orientation = orient_from(network, estimate)
     except GeometryError as error:
         failure = error
         if measured.photographs is not None:

@@ -127,7 +127,7 @@ def test_a_principal_distance_that_loses_photographs_is_reported(free: bool) -> 
     start = empty_estimate(network, (given,))
     few = orientation(network, replace(partly(truth, np.arange(IMAGES) < 3), cameras=(given,)))
 
-    def orient_from(values: Estimate) -> Orientation:
+    def orient_from(_: Network, values: Estimate) -> Orientation:
         if values.cameras[0].value("c") < 9:
             raise GeometryError("none")
         return orientation(network, truth)
@@ -145,11 +145,11 @@ def test_another_c_orients_the_larger_part_of_what_was_lost(oriented: int, bette
     network, truth = make_network(seed_of("lost by c"), images=IMAGES, points=POINTS)
     few = orientation(network, partly(truth, np.arange(IMAGES) < 3))
     more = orientation(network, partly(truth, np.arange(IMAGES) < oriented))
-    remarks = try_other_principal_distances(network, truth, few, lambda _: more)[1]
+    remarks = try_other_principal_distances(network, truth, few, lambda *_: more)[1]
     assert bool(remarks) == better
     alone = orientation(network, partly(truth, np.arange(IMAGES) < IMAGES - 1))
     whole = orientation(network, truth)
-    assert try_other_principal_distances(network, truth, alone, lambda _: whole) == (alone, ())
+    assert try_other_principal_distances(network, truth, alone, lambda *_: whole) == (alone, ())
 
 
 def test_principal_distances_of_a_crop_factor_an_extender_and_zooms_are_tried() -> None:
@@ -157,7 +157,7 @@ def test_principal_distances_of_a_crop_factor_an_extender_and_zooms_are_tried() 
     few = orientation(network, partly(truth, np.arange(IMAGES) < 3))
     tried = []
 
-    def refuse(values: Estimate) -> Orientation:
+    def refuse(_: Network, values: Estimate) -> Orientation:
         tried.append(values.cameras[0].value("c") / truth.cameras[0].value("c"))
         raise GeometryError("none")
 
@@ -172,7 +172,7 @@ def test_another_c_is_likelier_for_all_image_points(times: float, better: bool) 
     few = orientation(network, partly(truth, np.arange(IMAGES) < 5))
     more = orientation(network, partly(truth, np.arange(IMAGES) < 8))
     more = replace(more, rms_px=times * few.rms_px)
-    remarks = try_other_principal_distances(network, truth, few, lambda _: more)[1]
+    remarks = try_other_principal_distances(network, truth, few, lambda *_: more)[1]
     assert bool(remarks) == better
 
 
@@ -196,7 +196,7 @@ def test_misfits_lie_anywhere_in_the_photograph_they_are_in(
     truth = replace(truth, cameras=tuple(cameras[k] for k in order))
     few = orientation(network, partly(truth, np.arange(IMAGES) < 3))
     more = replace(orientation(network, truth), rms_px=30.0)
-    assert bool(try_other_principal_distances(network, truth, few, lambda _: more)[1]) == better
+    assert bool(try_other_principal_distances(network, truth, few, lambda *_: more)[1]) == better
 
 
 def test_no_other_c_is_tried_for_mirrored_pictures() -> None:
@@ -220,7 +220,7 @@ def test_residuals_far_above_their_sigmas_are_tried_with_cameras_held(
     wrong = replace(orientation(network, replace(truth, cameras=(camera,))), rms_px=times * 0.1)
     factors = []
 
-    def orient_from(values: Estimate) -> Orientation:
+    def orient_from(_: Network, values: Estimate) -> Orientation:
         factors.append(values.cameras[0].value("c") / camera.value("c"))
         assert not values.cameras[0].free.any()
         if factors[-1] > 0.8:
@@ -249,7 +249,7 @@ def test_no_other_camera_is_tried_where_pairs_alone_fit_no_better(
     present = replace(present, fits=present.fits & (seed_of("fitting").permutation(k) < fitting * k))
     factors = []
 
-    def orient_from(values: Estimate) -> Orientation:
+    def orient_from(_: Network, values: Estimate) -> Orientation:
         factors.append(values.cameras[0].value("c"))
         return present
 
@@ -258,7 +258,7 @@ def test_no_other_camera_is_tried_where_pairs_alone_fit_no_better(
     assert bool(factors) == tried
 
 
-def _none(_: Estimate) -> Orientation:
+def _none(*_: object) -> Orientation:
     raise AssertionError("tried")
 
 

@@ -27,7 +27,8 @@ from scipy.sparse import csr_matrix
 
 from sfm.model.camera import tangents_from_pixel
 from sfm.model.conventions import BoolArray, FloatArray, IntArray
-from sfm.model.network import rows_of
+from sfm.model.estimate import Estimate
+from sfm.model.network import Network, rows_of
 from sfm.model.remarks.remark import remark
 from sfm.model.similarity import reverse_depth
 from sfm.orientation.incremental.growth import Growth, Refine
@@ -188,14 +189,14 @@ def reversed_growth(growth: Growth, empty: Growth, refine: Refine, without: Bool
     return empty
 
 
-def best_connected(growth: Growth, most: int) -> BoolArray:
+def best_connected(network: Network, estimate: Estimate, most: int) -> BoolArray:
     """Return a part of the oriented photographs, (m,): each has most points in common with those before.
 
     Args:
-        growth: the network.
+        network: network of m photographs.
+        estimate: its orientation.
         most: number of photographs; all oriented ones if there are fewer.
     """
-    network, estimate = growth.network, growth.estimate
     if estimate.oriented.sum() <= most:
         return estimate.oriented
     seen = network.image_points

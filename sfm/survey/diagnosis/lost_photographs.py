@@ -28,6 +28,7 @@ from __future__ import annotations
 import math
 from collections.abc import Callable
 from dataclasses import dataclass, replace
+from functools import partial
 
 import cv2
 import numpy as np
@@ -51,7 +52,8 @@ from sfm.model.similarity import mean_distance, nearest_rotation
 from sfm.model.solution import Solution
 from sfm.orientation.image_rays import image_tangents, rays_of
 from sfm.orientation.incremental.growth import MIN_SHARE, TOLERANCE_FACTOR, residual_lengths
-from sfm.orientation.incremental.sequence import MIN_POINTS, Orientation
+from sfm.orientation.incremental.poor_photographs import best_connected
+from sfm.orientation.incremental.sequence import MIN_POINTS, MOST_REVERSED, Orientation
 from sfm.survey.diagnosis.photograph_cameras import MAJORITY_FRACTION
 
 MIN_RAYS = 2
@@ -154,7 +156,7 @@ def try_other_principal_distances(
     network: Network,
     estimate: Estimate,
     orientation: Orientation | None,
-    orient: Callable[[Estimate], Orientation],
+    orient: Callable[[Network, Estimate], Orientation],
     false_alarm: float = FALSE_ALARM,
 ) -> tuple[Orientation | None, tuple[Remark, ...]]:
     """Return the orientation with another principal distance if that orients more photographs, and remarks.
@@ -168,12 +170,13 @@ def try_other_principal_distances(
     have, they are tried with the cameras held. A network that estimates its camera while it grows may have
     moved along the valley of c and distance into a false minimum. They are not tried where nearly all image
     points fit as well as those of pairs of photographs do by themselves: no principal distance fits better.
+    Many photographs are oriented with them only if that is likelier for a part of them.
 
     Args:
         network: has the named image points.
         estimate: start values.
         orientation: the orientation with the given principal distance; None if there was none.
-        orient: returns the orientation from start values.
+        orient: returns the orientation of a network from start values.
         false_alarm: probability that a right result is called wrong.
 
     Returns:
@@ -192,8 +195,11 @@ def try_other_principal_distances(
     def starts(before: Orientation | None) -> list[Estimate]:
         if not single:
             return [_with_c(estimate, factor, free=True) for factor in C_FACTORS]
-        misfit = before is not None and free and before.rms_px > limit and not _fits_as_pairs(network, before)
-        return [_with_c(estimate, factor, free=False) for factor in (1.0, *C_FACTORS)] if misfit else []
+        if before is None or not free or before.rms_px <= limit or _fits_as_pairs(network, before):
+            return []
+        if _part_excludes_another_c(network, estimate, before, orient, false_alarm):
+            return []
+        return [_with_c(estimate, factor, free=False) for factor in (1.0, *C_FACTORS)]
 
     def gain(before: Orientation | None, after: Orientation | None) -> float:
         if _count_oriented(after) < least:
@@ -201,14 +207,10 @@ def try_other_principal_distances(
         return _likelihood(network, estimate.cameras, after) - _likelihood(network, estimate.cameras, before)
 
     def all_fits(after: Orientation | None) -> bool:
-        return (
-            after is not None
-            and _count_oriented(after) == m
-            and after.rms_px <= MISFIT * seen.median_sigma_px
-        )
+        return after is not None and _count_oriented(after) == m and after.rms_px <= limit
 
     row = Choice(starts, gain, lambda _, __: [(1, len(seen))], suffices=all_fits)
-    best = choose(orientation, (row,), orient, false_alarm=false_alarm)
+    best = choose(orientation, (row,), partial(orient, network), false_alarm=false_alarm)
     if best is None or best is orientation:
         return orientation, ()
     taken = orientation
@@ -231,6 +233,28 @@ def try_other_principal_distances(
         for given, better in zip(estimate.cameras, best.estimate.cameras, strict=True)
     )
     return taken, remarks
+
+
+def _part_excludes_another_c(
+    network: Network,
+    estimate: Estimate,
+    orientation: Orientation,
+    orient: Callable[[Network, Estimate], Orientation],
+    false_alarm: float,
+) -> bool:
+    """Return whether no other principal distance is likelier for the best connected of many photographs."""
+    images = best_connected(network, orientation.estimate, MOST_REVERSED)
+    if images.sum() == orientation.estimate.oriented.sum():
+        return False
+    rows = images[network.image_points.image]
+    points = _count_rays(network, rows) >= MIN_RAYS
+    rows &= points[network.image_points.point]
+    part, start = reduce_network(network, estimate, images, points, rows)
+    of_part = reduce_network(network, orientation.estimate, images, points, rows)[1]
+    fits = orientation.fits[rows]
+    square = float((residual_lengths(part, of_part)[fits] ** 2).mean()) if fits.any() else np.inf
+    before = replace(orientation, estimate=of_part, fits=fits, failures=(), rms_px=math.sqrt(square / 2))
+    return try_other_principal_distances(part, start, before, orient, false_alarm)[0] is before
 
 
 def _count_oriented(orientation: Orientation | None) -> int:
