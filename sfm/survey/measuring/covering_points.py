@@ -45,6 +45,7 @@ STEP = 1e-3  # towards the photograph, relative to the distance, that shows para
 # directions of MIN_COSINE and more are alike: the variance of slopes that are not known, times c^2.
 UNKNOWN_SLOPE = (1 / MIN_COSINE - 1) / 2
 MAX_ROUNDS = 5  # of matching on planes whose slopes move the borders of windows by more than COARSE_STEP
+SQUARES_AT_ONCE = 100_000  # that are projected together, all squares into each of several photographs
 TOLERANCE_PX = 1.5  # largest residual of a ray that stays with its point
 
 
@@ -204,19 +205,33 @@ def seen_squares(
     estimate: Estimate, camera: IntArray, squares: Squares, margin_px: int
 ) -> Iterator[tuple[int, IntArray, FloatArray]]:
     """Yield each oriented photograph that sees squares from their front, which these are, and where, px."""
-    for j in np.flatnonzero(estimate.oriented).tolist():
-        at = project_points(estimate, camera, np.full(len(squares), j), squares.planes.points)
-        size = np.array(estimate.cameras[camera[j]].size_px)
+    k, points = len(squares), squares.planes.points
+    oriented = np.flatnonzero(estimate.oriented)
+    for images in np.array_split(oriented, 1 + len(oriented) * k // SQUARES_AT_ONCE) if k else ():
+        image = np.repeat(images, k)
+        at = project_points(estimate, camera, image, np.tile(points, (len(images), 1)))
+        at = at.reshape(len(images), k, 2)
+        size = np.array([estimate.cameras[lens].size_px for lens in camera[images]])[:, None]
         with np.errstate(invalid="ignore"):
-            inside = ((at >= margin_px) & (at <= size - 1 - margin_px)).all(axis=1)
-        rows = np.flatnonzero(inside & (_cosines(estimate, j, squares.planes) > MIN_COSINE))
-        yield j, rows, at[rows]
+            seen = ((at >= margin_px) & (at <= size - 1 - margin_px)).all(axis=2)
+            seen &= _cosines(estimate.position[images], squares.planes) > MIN_COSINE
+        for j, of_image, rows in zip(images.tolist(), at, seen, strict=True):
+            if rows.any():
+                yield j, np.flatnonzero(rows), of_image[rows]
 
 
-def _cosines(estimate: Estimate, j: int, planes: Planes) -> FloatArray:
-    """Return the cosines of the angles between the normals of planes and their rays to photograph j, (k,)."""
-    ray = estimate.position[j] - planes.points
-    return np.asarray(np.sum(ray * planes.normal, axis=1) / np.linalg.norm(ray, axis=1))
+def _cosines(position: FloatArray, planes: Planes) -> FloatArray:
+    """Return the cosines of the angles between the normals of planes and their rays to positions.
+
+    Args:
+        position: projection centres, (m, 3).
+        planes: planes at k positions.
+
+    Returns:
+        Cosines, (m, k).
+    """
+    ray = position[:, None] - planes.points
+    return np.asarray(np.einsum("mkc,kc->mk", ray, planes.normal) / np.linalg.norm(ray, axis=2))
 
 
 def _visible(
@@ -404,7 +419,7 @@ def _placed(
     warp = plane_warps(estimate, camera, i, j, xy, planes.points, planes.normal, reach_px)
     with np.errstate(invalid="ignore"):  # for planes that the photograph does not see
         scale = np.sqrt(np.maximum(np.linalg.det(warp[:, :2, :2]), 0.0))
-        fits = _cosines(estimate, j, planes) > MIN_COSINE
+        fits = _cosines(estimate.position[j : j + 1], planes)[0] > MIN_COSINE
     fits &= np.isfinite(at).all(axis=1) & (scale > SCALES[0]) & (scale < SCALES[1])
     parallax = _parallaxes(estimate, camera, i, j, planes.points[fits], warp[fits])
     return _Placed(rows[fits], at[fits], warp[fits], scale[fits], parallax)
