@@ -45,6 +45,7 @@ from sfm.model.observations.pose import exterior_jacobian
 from sfm.runtime.compiling import compiled, kernel
 
 POINTS_AT_ONCE = 2000
+RUN = 256  # points whose effects on the reduced unknowns are taken together
 BYTES_AT_ONCE = 16_000_000  # bytes of the correlations held at a time
 
 
@@ -171,16 +172,16 @@ class _Errors(NamedTuple):
 class _OfPoints:
     """Covariances by R - I of the right-hand sides B'e of some object points."""
 
-    others: IntArray  # points in their photographs, sorted, (c,)
-    columns: IntArray  # scores that their photographs affect, (s,)
+    others: IntArray  # points in their photographs, (c,)
     with_points: FloatArray  # with B'e of these points, (3 p, 3 c)
-    direct: FloatArray  # with A'e, of which the scores are A'e - W V^-1 B'e, (3 p, s)
-    indirect: FloatArray  # with W V^-1 B'e, (3 p, s)
-    through: FloatArray  # the columns of W V^-1 that belong to the points themselves, transposed, (3 p, s)
+    direct: FloatArray  # with A'e, of which the scores are A'e - W V^-1 B'e, (3 p, reduced + d)
+    indirect: FloatArray  # with W V^-1 B'e, (3 p, reduced + d)
+    columns: IntArray  # scores in which B'e of the points themselves takes part, (s,)
+    through: FloatArray  # how: these columns of W V^-1, transposed, (3 p, s)
 
     @property
     def with_scores(self) -> FloatArray:
-        """The covariances with the scores, (3 p, s)."""
+        """The covariances with the scores, (3 p, reduced + d)."""
         return self.direct - self.indirect
 
 
@@ -193,23 +194,20 @@ class _ErrorsInCommon:
     errors: _Errors
     column: IntArray  # reduced unknowns of the pose and the camera of each photograph, (m, 6 + f)
     shows: csr_matrix  # which photographs show each point with such errors, (n, m)
+    order: IntArray  # points with such errors, those in about the same photographs one after the other
     inverse: FloatArray  # V^-1 of each point, 0 for kept points, (n, 3, 3)
 
     def parts(self, points: IntArray) -> Iterator[IntArray]:
-        """Yield points in parts whose covariances take no more memory than the derivatives do.
+        """Yield points in parts whose covariances take about as much memory as the derivatives do.
 
-        The points of a part are in the same photographs, as far as possible; those without errors in common
-        are in no part.
+        Points without errors in common are in no part.
         """
-        errors = self.errors
-        seen = points[np.diff(errors.first_of_point)[points] > 0]
-        first = errors.image[errors.of_point[errors.first_of_point[seen]]]
-        left = [seen[np.argsort(first, kind="stable")]] if len(seen) else []
+        left = [self.order[np.isin(self.order, points)]]
         while left:
             part = left.pop()
-            if len(part) > 1 and 9 * len(part) * len(self._beside(part)) > errors.by_cameras.size:
+            if len(part) > 1 and 9 * len(part) * len(self._beside(part)) > 2 * self.errors.by_cameras.size:
                 left += np.array_split(part, 2)
-            else:
+            elif len(part):
                 yield part
 
     def no_cameras(self) -> FloatArray:
@@ -218,10 +216,12 @@ class _ErrorsInCommon:
         return np.zeros((m, unknowns, unknowns))
 
     def _beside(self, points: IntArray) -> IntArray:
-        """Return the points in all photographs that show some points, sorted, (c,)."""
-        first = self.errors.first
-        images = np.unique(self.shows[points].indices)
-        return np.unique(np.concatenate([self.errors.point[first[i] : first[i + 1]] for i in images]))
+        """Return the points in all photographs that show some points, and others of their runs, in order."""
+        first, beside = self.errors.first, np.zeros(len(self.inverse), dtype=bool)
+        for i in np.unique(self.shows[points].indices).tolist():
+            beside[self.errors.point[first[i] : first[i + 1]]] = True
+        runs = np.add.reduceat(beside[self.order], np.arange(0, len(self.order), RUN)) > 0
+        return self.order[np.repeat(runs, RUN)[: len(self.order)]]
 
     def of_points(self, points: IntArray, cameras: FloatArray) -> _OfPoints:
         """Return the covariances of the right-hand sides of some points.
@@ -231,28 +231,39 @@ class _ErrorsInCommon:
             cameras: covariances of A'e of each photograph, (m, 6 + f, 6 + f); their shares are added.
         """
         influence, others = self.influence, self._beside(points)
-        n, reduced = len(self.inverse), len(influence.H)
-        shown = influence.through[:, (3 * others[:, None] + np.arange(3)).ravel()]
-        columns = np.union1d(shown.indices, self.column[np.unique(self.shows[points].indices)])
-        place, place_of_point = np.zeros(reduced, dtype=np.int64), np.zeros(n, dtype=np.int64)
-        place[columns], place_of_point[others] = np.arange(len(columns)), np.arange(len(others))
-        of_reduced = csr_matrix(
-            (shown.data, place[shown.indices], shown.indptr), shape=(3 * len(others), len(columns))
-        )
-        of_datum = self.inverse[others] @ influence.of_datum[others]
-        d = of_datum.shape[2]
-        through = np.hstack([of_reduced.toarray(), -of_datum.reshape(3 * len(others), d)])
-        with_points = np.zeros((3 * len(points), 3 * len(others)))
-        with_cameras = np.zeros((3 * len(points), through.shape[1]))
+        p = 3 * len(points)
+        place = np.zeros(len(self.inverse), dtype=np.int64)
+        place[others] = np.arange(len(others))
+        with_points = np.zeros((p, 3 * len(others)))
+        with_scores = np.zeros((p, len(influence.unknowns)))
         _add_pairs(
             self.errors,
-            (points, place_of_point, place[self.column]),
+            (points, place, self.column),
             (float(self.correlation.common), float(self.correlation.length_px)),
-            (with_points, with_cameras, cameras),
+            (with_points, with_scores, cameras),
         )
-        own = (3 * place_of_point[points][:, None] + np.arange(3)).ravel()
-        columns = np.concatenate([columns, np.arange(reduced, reduced + d)])
-        return _OfPoints(others, columns, with_points, with_cameras, with_points @ through, through[own])
+        indirect = np.zeros((len(influence.unknowns), p))
+        for first in range(0, len(others), RUN):
+            run = others[first : first + RUN]
+            of_run = with_points[:, 3 * first : 3 * (first + len(run))]
+            columns, through = self._through(run)
+            indirect[columns] += through.T @ of_run.T
+        columns, through = self._through(points)
+        return _OfPoints(others, with_points, with_scores, indirect.T, columns, through)
+
+    def _through(self, points: IntArray) -> tuple[IntArray, FloatArray]:
+        """Return the rows of W V^-1 that are not 0 for some points, and these rows, transposed, (3 p, s)."""
+        influence, reduced = self.influence, len(self.influence.H)
+        shown = influence.through[:, (3 * points[:, None] + np.arange(3)).ravel()]
+        touched = np.flatnonzero(np.bincount(shown.indices, minlength=reduced))
+        place = np.zeros(reduced, dtype=np.int64)
+        place[touched] = np.arange(len(touched))
+        shape = (3 * len(points), len(touched))
+        rows = csr_matrix((shown.data, place[shown.indices], shown.indptr), shape=shape).toarray()
+        of_datum = self.inverse[points] @ influence.of_datum[points]
+        d = of_datum.shape[2]
+        columns = np.concatenate([touched, np.arange(reduced, reduced + d)])
+        return columns, np.hstack([rows, -of_datum.reshape(shape[0], d)])
 
 
 @dataclass(frozen=True)
@@ -280,7 +291,7 @@ class CorrelatedPart:
         for part in self.in_common.parts(np.asarray(points)):
             of = self.in_common.of_points(part, cameras)
             rows = (3 * place[part][:, None] + np.arange(3)).ravel()
-            of_all[rows] = _times(inverse[part], of.with_scores @ C[of.columns])
+            of_all[rows] = _times(inverse[part], of.with_scores @ C)
             asked = np.flatnonzero(place[of.others] >= 0)
             columns = (3 * place[of.others[asked]][:, None] + np.arange(3)).ravel()
             between = of.with_points[:, (3 * asked[:, None] + np.arange(3)).ravel()]
@@ -331,8 +342,11 @@ def correlated_part(
     for points in in_common.parts(np.arange(n)):
         of = in_common.of_points(points, cameras)
         half = of.through.T @ (of.direct - of.indirect / 2)
-        middle[np.ix_(of.columns, of.columns)] -= half + half.T
-        at = 3 * np.searchsorted(of.others, points)[:, None] + np.arange(3)
+        middle[of.columns] -= half
+        middle[:, of.columns] -= half.T
+        at = np.full(n, -1)
+        at[of.others] = np.arange(len(of.others))
+        at = 3 * at[points][:, None] + np.arange(3)
         alone = of.with_points.reshape(-1, 3, of.with_points.shape[1])
         alone = inverse[points] @ np.take_along_axis(alone, at[:, None], axis=2) @ inverse[points]
         right = influence.unknowns[of.columns] @ influence.of_points(
@@ -379,7 +393,11 @@ def _errors_in_common(
     inverse = linear.V_inverse.data.reshape(n, 3, 3).copy()  # its only blocks are on the diagonal
     inverse[layout.kept] = 0.0
     shows = csr_matrix((np.ones(len(rows), dtype=np.int8), (point, image)), shape=(n, m))
-    return _ErrorsInCommon(influence, correlation, errors, linear.column, shows, inverse)
+    rays = np.diff(errors.first_of_point)
+    seen = np.flatnonzero(rays)
+    first = image[errors.of_point[errors.first_of_point[seen]]]
+    order = seen[np.lexsort([first, -np.floor(np.log2(rays[seen]))])]
+    return _ErrorsInCommon(influence, correlation, errors, linear.column, shows, order, inverse)
 
 
 def _times(blocks: FloatArray, values: FloatArray) -> FloatArray:

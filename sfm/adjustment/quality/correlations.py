@@ -53,7 +53,9 @@ from sfm.runtime.threads import own_threads
 
 CELLS = 24  # grid cells along the longer side of the photograph
 HALVINGS = 7  # halvings of the longer side down to the smallest cells and shortest correlation
-DRAWS = 16  # random fields of each length
+# Random fields of each length. Together they have at least so many photographs, as mean squares of few
+# have much noise; 60 photographs and fewer have the largest number of fields.
+FIELDS_OF_PHOTOGRAPHS, MOST_DRAWS = 960, 16
 WAVES = 64  # waves in the field of one photograph
 ROUNDS = 5  # rounds of weighting by the expectations; the second round hardly changes them
 PARTS = ("X0", "Y0", "Z0", "omega", "phi", "kappa")
@@ -210,10 +212,11 @@ def _correlation_of(
         return _squares(linear.residuals(errors.reshape(2 * len(used), -1)), cells)
 
     relative = adjustment.usual_px * linear.whitening
-    alone = left_of(rng.standard_normal((len(used), 2, DRAWS)))
+    draws = _draws(o.image)
+    alone = left_of(rng.standard_normal((len(used), 2, draws)))
     best, least = None, np.inf
     for length in size / 2.0 ** np.arange(HALVINGS):
-        common = left_of(relative @ _fields(o.image, o.xy, length, rng))
+        common = left_of(relative @ _fields(o.image, o.xy, length, draws, rng))
         expected = squares
         for _ in range(ROUNDS):
             sigma = expected / np.sqrt(count)  # for the sum of squares of `count` pairs x, y
@@ -263,9 +266,10 @@ def design_effect_of_neighbours(adjustment: Adjustment, *, density: float = 1.0)
         moved = errors - linear.B @ (linear.V_inverse @ (linear.B.T @ errors))
         return float((moved**2).sum() - (linear.residuals(errors) ** 2).sum())
 
-    alone = of_shared(rng.standard_normal((len(used), 2, DRAWS)))
+    draws = _draws(o.image)
+    alone = of_shared(rng.standard_normal((len(used), 2, draws)))
     relative = adjustment.usual_px * linear.whitening
-    common = of_shared(relative @ _fields(o.image, o.xy, correlation.length_px, rng))
+    common = of_shared(relative @ _fields(o.image, o.xy, correlation.length_px, draws, rng))
     return max(correlation.alone + correlation.common * density * common / alone, 1.0) if alone > 0 else 1.0
 
 
@@ -287,18 +291,25 @@ def _squares(v: FloatArray, cells: list[csr_matrix]) -> FloatArray:
     return np.array([float((v**2).sum()), *(float(((cell @ v) ** 2).sum()) for cell in cells)]) / draws
 
 
-def _fields(image: IntArray, xy: FloatArray, length_px: float, rng: np.random.Generator) -> FloatArray:
-    """Return random fields in each photograph with covariance exp(-d / length), (k, 2, DRAWS).
+def _draws(image: IntArray) -> int:
+    """Return the number of random fields in photographs that have image points, from those of each, (k,)."""
+    return min(MOST_DRAWS, -(-FIELDS_OF_PHOTOGRAPHS // len(np.unique(image))))
+
+
+def _fields(
+    image: IntArray, xy: FloatArray, length_px: float, draws: int, rng: np.random.Generator
+) -> FloatArray:
+    """Return random fields in each photograph with covariance exp(-d / length), (k, 2, draws).
 
     Wave numbers are drawn from its spectrum, a bivariate Cauchy distribution.
     """
-    field = np.empty((len(xy), 2, DRAWS))
+    field = np.empty((len(xy), 2, draws))
     for rows in rows_of(image, int(image.max()) + 1):
         waves = rng.standard_normal((2, WAVES)) / np.abs(rng.standard_normal(WAVES)) / length_px
         phase = xy[rows] @ waves
-        amplitude = rng.standard_normal((2, WAVES, 2 * DRAWS)) / np.sqrt(WAVES)
+        amplitude = rng.standard_normal((2, WAVES, 2 * draws)) / np.sqrt(WAVES)
         drawn = np.cos(phase) @ amplitude[0] + np.sin(phase) @ amplitude[1]
-        field[rows] = drawn.reshape(len(rows), 2, DRAWS)
+        field[rows] = drawn.reshape(len(rows), 2, draws)
     return field
 
 
