@@ -30,7 +30,14 @@ from sfm.adjustment.engine.cofactors import (
     marginal_covariance,
     without_held,
 )
-from sfm.adjustment.engine.correlated import CorrelatedPart, Influence, correlated_part, influence_of
+from sfm.adjustment.engine.correlated import (
+    CorrelatedPart,
+    Influence,
+    correlated_part,
+    influence_of,
+    largest_factor,
+    whitening_matrices,
+)
 from sfm.adjustment.engine.iterate import Optimum, optimum_at, problem_of
 from sfm.adjustment.engine.observed import ObservedKind, observed_of
 from sfm.adjustment.engine.unknowns import Unknowns, unknowns_of
@@ -47,6 +54,9 @@ from sfm.runtime.threads import own_threads
 
 # Distance from the origin, in extents of the network, at which an axis is reduced: three digits are lost.
 MAX_EXTENTS = 1000.0
+# Factor of variances below which correlated errors are not propagated. Standard deviations of one and a half
+# significant digits do not show 5 %.
+MOST_FACTOR = 1.05**2
 MIN_SORTED_POINTS = 5000  # number of points from which order matters; fewer stay in the cache
 LEVELS = 10  # levels of the curve: each axis is cut into 2^10 parts
 
@@ -73,26 +83,43 @@ class Marginal:
 
     @cached_property
     def correlated(self) -> CorrelatedPart | None:
-        """Part of the covariance due to correlated errors; None if errors are independent."""
+        """Part of the covariance due to correlated errors; None if errors are independent, or nearly."""
         a = self.adjustment
-        if a.error_correlation is None:
+        if a.error_correlation is None or np.isfinite(self.factor):
             return None
         which = a.network.may_correlate[self.layout.order]
         return correlated_part(self.influence, a.error_correlation, a.usual_px, which)
 
-    def of_independent_errors(self) -> Covariance:
-        """Return the covariance of points, exterior and interior orientation without the correlated part."""
-        marginal = marginal_covariance(self.optimum, self.layout, self.cofactors, self.adjustment.sigma0**2)
+    @cached_property
+    def factor(self) -> float:
+        """Factor of all variances in place of their part due to correlated errors; infinite if that is large.
+
+        It is a bound, so that no variance is stated too small.
+        """
+        a, layout = self.adjustment, self.layout
+        if a.error_correlation is None:
+            return 1.0
+        weight = np.ascontiguousarray(a.weights[layout.order])
+        relative = a.usual_px * whitening_matrices(layout.observations, weight)
+        which = a.network.may_correlate[layout.order]
+        return largest_factor(layout.observations, relative, a.error_correlation, which, MOST_FACTOR)
+
+    def of_independent_errors(self, factor: float = 1.0) -> Covariance:
+        """Return the covariance of points, exterior and interior orientation without the correlated part.
+
+        Args:
+            factor: factor of all variances.
+        """
+        variance = factor * self.adjustment.sigma0**2
+        marginal = marginal_covariance(self.optimum, self.layout, self.cofactors, variance)
         return without_held(marginal, self.layout, self.optimum)
 
     def covariance(self) -> Covariance:
         """Return the marginal covariances of points, exterior and interior orientation."""
-        covariance, variance = self.of_independent_errors(), self.adjustment.sigma0**2
-        return (
-            covariance
-            if self.correlated is None
-            else self.correlated.added_to(covariance, variance, self.optimum)
-        )
+        if self.correlated is None:
+            return self.of_independent_errors(self.factor)
+        variance = self.adjustment.sigma0**2
+        return self.correlated.added_to(self.of_independent_errors(), variance, self.optimum)
 
     def joint(self, unknowns: IntArray, points: IntArray) -> FloatArray:
         """Return the joint covariance of some reduced unknowns and some object points.
@@ -136,7 +163,9 @@ class Marginal:
         cofactor -= half.T
         del half  # each term is as large as the whole covariance
         cofactor += H @ Q.G @ H.T
-        if self.correlated is not None:
+        if self.correlated is None:
+            cofactor *= self.factor
+        else:
             cofactor += self.correlated.joint(unknowns, np.asarray(points))
         largest = largest_fixed(self.optimum, self.layout, Q)[points].ravel()
         fixed = u + np.flatnonzero(np.diagonal(cofactor)[u:] <= largest)
@@ -277,7 +306,7 @@ def with_error_correlation(adjustment: Adjustment, correlation: ErrorCorrelation
 
 def _with_covariance(m: Marginal) -> Adjustment:
     """Return the adjustment with the covariance in the datum of the marginal."""
-    independent = None if m.correlated is None else m.of_independent_errors()
+    independent = None if m.adjustment.error_correlation is None else m.of_independent_errors()
     return replace(m.adjustment, covariance=m.covariance(), independent=independent, judge=None)
 
 

@@ -10,7 +10,7 @@ import pytest
 from scipy.spatial.distance import cdist
 
 from sfm.adjustment.covariance import change_datum, marginal_of, with_error_correlation
-from sfm.adjustment.engine.correlated import correlated_sum
+from sfm.adjustment.engine.correlated import correlated_sum, largest_factor
 from sfm.adjustment.quality.correlations import (
     design_effect_of_neighbours,
     estimate_error_correlation,
@@ -141,6 +141,44 @@ def test_every_covariance_has_the_common_errors(unequal: tuple[Network, Estimate
     assert found.cofactors.points == pytest.approx(plain.cofactors.points, rel=1e-9, abs=1e-15)
     none = with_error_correlation(plain, ErrorCorrelation(alone=1.0, common=0.0, length_px=200.0))
     assert none.covariance.points == pytest.approx(plain.covariance.points, rel=1e-9, abs=1e-15)
+
+
+@pytest.mark.parametrize("length_px", [20.0, 200.0])
+def test_no_function_of_errors_varies_more_than_the_bound(
+    unequal: tuple[Network, Estimate], length_px: float
+) -> None:
+    """The bound is above the largest eigenvalue of R, by less than a third of what R adds to I."""
+    network, truth = unequal
+    a = adjusted(network, truth, in_common(network, 0.0, 1.0, seed_of("bound")))
+    m, correlation = marginal_of(a), ErrorCorrelation(alone=0.9, common=0.1, length_px=length_px)
+    o, relative = m.layout.observations, a.usual_px * m.influence.linear.whitening
+    every, largest = np.ones(len(o.image), dtype=bool), 0.0
+    for rows in rows_of(o.image, len(network.images)):
+        C = 0.1 * np.exp(-cdist(o.xy[rows], o.xy[rows]) / length_px)
+        R = np.einsum("aij,ab,bkj->aibk", relative[rows], C, relative[rows]).reshape(2 * len(rows), -1)
+        largest = max(largest, float(np.linalg.eigvalsh(R + 0.9 * np.eye(len(R)))[-1]))
+    bound = largest_factor(o, relative, correlation, every, np.inf)
+    assert largest <= bound < largest + 2.0 * (largest - 0.9)
+    assert largest_factor(o, relative, correlation, every, largest - 0.01) == np.inf
+
+
+def test_errors_hardly_in_common_widen_every_covariance_a_little(scene: tuple[Network, Estimate]) -> None:
+    """No standard deviation is smaller than the exact one, and none larger by more than 5 %."""
+    network, truth = scene
+    plain = adjusted(network, truth, in_common(network, 0.0, 1.0, seed_of("hardly")))
+    correlation = ErrorCorrelation(alone=0.999, common=0.002, length_px=20.0)
+    found = with_error_correlation(plain, correlation)
+    m, points = marginal_of(found), np.array([7, 3, 200])
+    assert m.correlated is None and 1.0 < m.factor <= 1.05**2
+    Z = m.influence.of(np.arange(12), points)
+    o, relative = m.layout.observations, found.usual_px * m.influence.linear.whitening
+    exact = correlated_sum(o.image, o.xy, relative, Z, correlation, np.ones(len(o.image), dtype=bool))
+    exact += np.tensordot(Z, Z, axes=((0, 1), (0, 1)))
+    ratio = np.diagonal(m.joint(np.arange(12), points)) / (found.sigma0**2 * np.diagonal(exact))
+    assert ratio.min() >= 1 - 1e-9 and ratio.max() <= 1.05**2
+    assert found.covariance.points[7] == pytest.approx(m.joint(np.zeros(0, dtype=int), points[:1]), rel=1e-6)
+    assert found.covariance.exterior == pytest.approx(m.factor * plain.covariance.exterior, rel=1e-9)
+    assert found.cofactors.points == pytest.approx(plain.cofactors.points, rel=1e-9)
 
 
 def test_common_errors_take_little_memory() -> None:

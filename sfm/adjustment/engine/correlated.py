@@ -46,6 +46,7 @@ from sfm.runtime.compiling import compiled, kernel
 
 POINTS_AT_ONCE = 2000
 RUN = 256  # points whose effects on the reduced unknowns are taken together
+CELLS_PER_LENGTH, LENGTHS_SUMMED = 8, 20  # of the bound of common errors, per correlation length
 BYTES_AT_ONCE = 16_000_000  # bytes of the correlations held at a time
 
 
@@ -466,6 +467,50 @@ def _add_pairs(
                     )
 
 
+def largest_factor(
+    observations: Observations,
+    relative: FloatArray,
+    correlation: ErrorCorrelation,
+    which: BoolArray,
+    most: float,
+) -> float:
+    """Return a bound of the factor of the variance of any function of errors, infinite beyond `most`.
+
+    It is the largest row sum of R, which no eigenvalue of R exceeds (Gershgorin's theorem). Distances are
+    those between the nearest parts of small cells, so that a convolution gives the sums of all cells.
+
+    Args:
+        observations: k image points.
+        relative: whitening of each image point relative to a usual one, (k, 2, 2).
+        correlation: correlation of the errors.
+        which: image points with correlated errors, (k,).
+        most: largest factor that is asked for.
+
+    Source: Golub and Van Loan (2013), Matrix Computations, sec. 7.2.1.
+    """
+    from scipy.signal import fftconvolve  # importing takes half a second, and most commands never need it
+
+    side_px, factor = correlation.length_px / CELLS_PER_LENGTH, 1.0
+    o = observations
+    for photograph in _photographs(o.image, o.xy, relative, correlation, which):
+        if not len(photograph.rows):
+            continue
+        cell = np.floor((photograph.xy - photograph.xy.min(axis=0)) / side_px).astype(np.int64)
+        weight = np.zeros(cell.max(axis=0) + 1)
+        np.add.at(weight, tuple(cell.T), np.linalg.norm(photograph.relative, ord=2, axis=(1, 2)) ** 2)
+        beside = np.arange(-LENGTHS_SUMMED * CELLS_PER_LENGTH, LENGTHS_SUMMED * CELLS_PER_LENGTH + 1)
+        apart = np.maximum(np.abs(beside) - 1, 0) / CELLS_PER_LENGTH  # in correlation lengths
+        shared = np.exp(-np.hypot(apart[:, None], apart))
+        sums = fftconvolve(weight, shared, mode="full")
+        middle = len(beside) // 2
+        largest = float(sums[cell[:, 0] + middle, cell[:, 1] + middle].max())
+        largest += float(np.exp(-LENGTHS_SUMMED) * weight.sum())
+        factor = max(factor, correlation.alone + correlation.common * largest)
+        if factor > most:
+            return np.inf
+    return factor
+
+
 def correlated_sum(
     image: IntArray,
     xy: FloatArray,
@@ -551,8 +596,7 @@ def linearise(optimum: Optimum, layout: Unknowns, weight: FloatArray) -> Lineari
     of_point = 3 * o.point[~kept][:, None] + np.arange(3)
     half = solve_lower(L, np.tile(np.eye(3), (n, 1, 1)))
     V_inverse = half.transpose(0, 2, 1) @ half
-    F = np.zeros((k, 2, 2))
-    F[:, 0, 0], F[:, 1, 0], F[:, 1, 1] = (o.whitening * np.sqrt(weight * o.share)[:, None]).T
+    F = whitening_matrices(o, weight)
     return Linearised(
         layout,
         optimum.factor,
@@ -565,6 +609,14 @@ def linearise(optimum: Optimum, layout: Unknowns, weight: FloatArray) -> Lineari
         np.where(kept[:, None, None], 0.0, B) @ V_inverse[o.point],
         F,
     )
+
+
+def whitening_matrices(observations: Observations, weight: FloatArray) -> FloatArray:
+    """Return F of each image point with F'F its weight, 1/px, (k, 2, 2), from factors on weights, (k,)."""
+    F = np.zeros((len(weight), 2, 2))
+    scale = np.sqrt(weight * observations.share)[:, None]
+    F[:, 0, 0], F[:, 1, 0], F[:, 1, 1] = (observations.whitening * scale).T
+    return F
 
 
 def _of_rays(values: FloatArray, column: IntArray, which: BoolArray, columns: int) -> csr_matrix:
