@@ -196,8 +196,11 @@ def _correlation_of(
     size = max(max(camera.size_px) for camera in adjustment.estimate.cameras)
     cells = []  # which image points are in each nonempty cell of the photographs, sparse, (cells, k)
     for n in range(1, HALVINGS + 1):
-        of_cell = np.column_stack([o.image, np.floor(o.xy / (size / 2.0**n))])[used]
-        cell = np.unique(of_cell, axis=0, return_inverse=True)[1].ravel()
+        place_of_cell = np.floor(o.xy[used] / (size / 2.0**n)).astype(np.int64)
+        place_of_cell -= place_of_cell.min(axis=0)
+        columns, rows = place_of_cell.max(axis=0) + 1
+        number = (o.image[used] * columns + place_of_cell[:, 0]) * rows + place_of_cell[:, 1]
+        cell = np.unique(number, return_inverse=True)[1].ravel()
         ones, place = np.ones(len(cell)), (cell, np.flatnonzero(used))
         cells.append(csr_matrix((ones, place), shape=(cell.max() + 1, len(used))))
     v = linear.whitening @ adjustment.residuals[m.layout.order][:, :, None]
