@@ -350,9 +350,7 @@ def correlated_part(
         at = 3 * at[points][:, None] + np.arange(3)
         alone = of.with_points.reshape(-1, 3, of.with_points.shape[1])
         alone = inverse[points] @ np.take_along_axis(alone, at[:, None], axis=2) @ inverse[points]
-        right = influence.unknowns[of.columns] @ influence.of_points(
-            (3 * points[:, None] + np.arange(3)).ravel()
-        )
+        right = influence.unknowns @ influence.of_points((3 * points[:, None] + np.arange(3)).ravel())
         scores = _times(inverse[points], of.with_scores).reshape(len(points), 3, -1)
         half = np.einsum("pas,spb->pab", scores, right.reshape(-1, len(points), 3), optimize=True)
         limiting[points] = alone
