@@ -54,9 +54,10 @@ from sfm.runtime.threads import own_threads
 
 # Distance from the origin, in extents of the network, at which an axis is reduced: three digits are lost.
 MAX_EXTENTS = 1000.0
-# Factor of variances below which correlated errors are not propagated. Standard deviations of one and a half
-# significant digits do not show 5 %.
-MOST_FACTOR = 1.05**2
+# Bound of the factor of variances up to which it takes the place of the propagation of correlated errors.
+# Standard deviations by a correlation that residuals show are right to 15 %
+# (tests/adjustment/test_error_correlation.py).
+MOST_FACTOR = 1.1**2
 MIN_SORTED_POINTS = 5000  # number of points from which order matters; fewer stay in the cache
 LEVELS = 10  # levels of the curve: each axis is cut into 2^10 parts
 

@@ -175,19 +175,19 @@ def test_no_function_of_errors_varies_more_than_the_bound(
 
 
 def test_errors_hardly_in_common_widen_every_covariance_a_little(scene: tuple[Network, Estimate]) -> None:
-    """No standard deviation is smaller than the exact one, and none larger by more than 5 %."""
+    """No standard deviation is smaller than the exact one, and none larger by more than 10 %."""
     network, truth = scene
     plain = adjusted(network, truth, in_common(network, 0.0, 1.0, seed_of("hardly")))
     correlation = ErrorCorrelation(alone=0.999, common=0.002, length_px=20.0)
     found = with_error_correlation(plain, correlation)
     m, points = marginal_of(found), np.array([7, 3, 200])
-    assert m.correlated is None and 1.0 < m.factor <= 1.05**2
+    assert m.correlated is None and 1.0 < m.factor <= 1.1**2
     Z = m.influence.of(np.arange(12), points)
     o, relative = m.layout.observations, found.usual_px * m.influence.linear.whitening
     exact = correlated_sum(o.image, o.xy, relative, Z, correlation, np.ones(len(o.image), dtype=bool))
     exact += np.tensordot(Z, Z, axes=((0, 1), (0, 1)))
     ratio = np.diagonal(m.joint(np.arange(12), points)) / (found.sigma0**2 * np.diagonal(exact))
-    assert ratio.min() >= 1 - 1e-9 and ratio.max() <= 1.05**2
+    assert ratio.min() >= 1 - 1e-9 and ratio.max() <= 1.1**2
     assert found.covariance.points[7] == pytest.approx(m.joint(np.zeros(0, dtype=int), points[:1]), rel=1e-6)
     assert found.covariance.exterior == pytest.approx(m.factor * plain.covariance.exterior, rel=1e-9)
     assert found.cofactors.points == pytest.approx(plain.cofactors.points, rel=1e-9)
