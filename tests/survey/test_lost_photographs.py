@@ -14,8 +14,10 @@ from sfm.model.conventions import BoolArray, FloatArray
 from sfm.model.errors import GeometryError
 from sfm.model.estimate import Estimate
 from sfm.model.network import ImagePoints, Network, Source, empty_estimate
+from sfm.model.reduced_network import reduce_network
 from sfm.model.remarks.remark import remark
 from sfm.orientation.incremental.sequence import Orientation
+from sfm.survey.diagnosis import lost_photographs
 from sfm.survey.diagnosis.lost_photographs import (
     MIN_PARALLAX,
     explain_lost_photographs,
@@ -256,6 +258,35 @@ def test_no_other_camera_is_tried_where_pairs_alone_fit_no_better(
     start = empty_estimate(network, truth.cameras)
     assert try_other_principal_distances(network, start, present, orient_from) == (present, ())
     assert bool(factors) == tried
+
+
+@pytest.mark.parametrize("better", [True, False])
+def test_many_photographs_get_another_camera_only_if_a_part_of_them_does(
+    monkeypatch: pytest.MonkeyPatch, better: bool
+) -> None:
+    """Five of ten photographs are tried first; if none of five cameras fits them, the ten are not tried."""
+    monkeypatch.setattr(lost_photographs, "MOST_REVERSED", 5)
+    network, truth = make_network(seed_of("false minimum"), images=IMAGES, points=POINTS, noise_px=0.1)
+    camera = replace(truth.cameras[0], free=np.ones_like(truth.cameras[0].free))
+    p = camera.parameters.copy()
+    p[camera.parts[0]] *= 1.02
+    wrong = replace(truth, cameras=(camera.with_parameters(p),))
+    present = replace(orientation(network, wrong), rms_px=5.0)
+    tried = []
+
+    def orient_from(part: Network, values: Estimate) -> Orientation:
+        tried.append(len(part.images))
+        if not better:
+            raise GeometryError("none")
+        images, points = np.isin(network.images, part.images), np.isin(network.points, part.points)
+        every = np.ones(len(network.image_points), dtype=bool)
+        right = reduce_network(network, replace(truth, cameras=values.cameras), images, points, every)[1]
+        return orientation(part, right)
+
+    start = empty_estimate(network, (camera,))
+    found, remarks = try_other_principal_distances(network, start, present, orient_from)
+    assert remarks == () and tried == ([5, IMAGES] if better else [5] * 5)
+    assert found is not None and found.rms_px == (0.1 if better else 5.0)
 
 
 def _none(*_: object) -> Orientation:
