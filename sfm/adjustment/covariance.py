@@ -54,9 +54,9 @@ from sfm.runtime.threads import own_threads
 
 # Distance from the origin, in extents of the network, at which an axis is reduced: three digits are lost.
 MAX_EXTENTS = 1000.0
-# Bound of the factor of variances up to which it takes the place of the propagation of correlated errors.
-# Standard deviations by a correlation that residuals show are right to 15 %
-# (tests/adjustment/test_error_correlation.py).
+# Bound of the factor of variances up to which it takes the place of the propagation of correlated errors,
+# which takes most of the time of many photographs. Standard deviations are then too large by 10 % at most,
+# less than the 15 % to which residuals tell the correlation (tests/adjustment/test_error_correlation.py).
 MOST_FACTOR = 1.1**2
 MIN_SORTED_POINTS = 5000  # number of points from which order matters; fewer stay in the cache
 LEVELS = 10  # levels of the curve: each axis is cut into 2^10 parts
@@ -86,13 +86,13 @@ class Marginal:
     def correlated(self) -> CorrelatedPart | None:
         """Part of the covariance due to correlated errors; None if errors are independent, or nearly."""
         a = self.adjustment
-        if a.error_correlation is None or np.isfinite(self.factor):
+        if a.error_correlation is None or np.isfinite(self.variance_factor):
             return None
         which = a.network.may_correlate[self.layout.order]
         return correlated_part(self.influence, a.error_correlation, a.usual_px, which)
 
     @cached_property
-    def factor(self) -> float:
+    def variance_factor(self) -> float:
         """Factor of all variances in place of their part due to correlated errors; infinite if that is large.
 
         It is a bound, so that no variance is stated too small.
@@ -118,7 +118,7 @@ class Marginal:
     def covariance(self) -> Covariance:
         """Return the marginal covariances of points, exterior and interior orientation."""
         if self.correlated is None:
-            return self.of_independent_errors(self.factor)
+            return self.of_independent_errors(self.variance_factor)
         variance = self.adjustment.sigma0**2
         return self.correlated.added_to(self.of_independent_errors(), variance, self.optimum)
 
@@ -165,7 +165,7 @@ class Marginal:
         del half  # each term is as large as the whole covariance
         cofactor += H @ Q.G @ H.T
         if self.correlated is None:
-            cofactor *= self.factor
+            cofactor *= self.variance_factor
         else:
             cofactor += self.correlated.joint(unknowns, np.asarray(points))
         largest = largest_fixed(self.optimum, self.layout, Q)[points].ravel()

@@ -189,7 +189,8 @@ def run_survey_file(survey_file: Path, options: RunOptions) -> Path:
             plot_process=plots,
         )
         if not revised and (store is None or not store.has_earlier):
-            history.add(Run(work, drawn.finished(), peak_bytes() / 1e6))
+            memory = peak_bytes() / 1e6 if options.cluster is None else 0.0  # blocks are elsewhere
+            history.add(Run(work, drawn.finished(), memory))
     seconds = time.perf_counter() - begun
     if options.product is not None:
         dependable = options.product.show(folder, pdf=options.pdf)

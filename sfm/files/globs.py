@@ -38,7 +38,7 @@ def nearest_name(path: Path) -> str:
 
 
 def name_of_model(path: Path) -> str:
-    """Return what to call a model after its file or folder, and the one above a number or `sparse`.
+    """Return what to call a model: its file or folder, and those above one that is a number or `sparse`.
 
     COLMAP numbers the models of a project, so that each project has one that is called 0.
     """

@@ -173,9 +173,7 @@ def _column(values: Sequence[object] | AnyArray) -> list[str]:
     values = values.tolist() if isinstance(values, np.ndarray) else values
     kinds = set(map(type, values))
     if kinds == {float}:
-        numbers = cast(Sequence[float], values)
-        cells = str(to_json(numbers, inf_nan_mode="null"), "ascii")[1:-1].split(",")
-        return ["" if cell == "null" else cell for cell in cells] if "null" in cells else cells
+        return _number_cells(cast(Sequence[float], values))
     if kinds == {int}:
         return list(map(str, values))
     if kinds == {str}:
@@ -190,12 +188,18 @@ def _quoted(cell: str) -> str:
     return '"' + cell.replace('"', '""') + '"' if "," in cell or '"' in cell else cell
 
 
+def _number_cells(numbers: Sequence[float]) -> list[str]:
+    """Return the cells of numbers, with all digits that tell them from others; empty if not finite."""
+    cells = str(to_json(numbers, inf_nan_mode="null"), "ascii")[1:-1].split(",")
+    return ["" if cell == "null" else cell for cell in cells] if "null" in cells else cells
+
+
 def _cell(value: object) -> str:
     """Return the cell of a value."""
     if isinstance(value, str):
         return _text_cell(value)
     if isinstance(value, float | np.floating):
-        return repr(float(value)) if math.isfinite(value) else ""
+        return _number_cells([float(value)])[0]
     return "" if value is None else str(value)
 
 

@@ -1,6 +1,7 @@
 """Memory of this process, its limit, and what of it is left, from what the system states.
 
-Source: Linux manual pages proc_meminfo(5), cgroups(7), getrlimit(2).
+Source: Linux manual pages proc_meminfo(5), proc_pid_status(5), cgroups(7), getrlimit(2); the kernel's
+documentation of control groups (memory.stat).
 """
 
 from __future__ import annotations
@@ -15,24 +16,24 @@ try:
     import resource
 except ImportError:  # Windows
     resource = None  # type: ignore[assignment]
-MEMINFO = Path("/proc/meminfo")
-# Memory limits of containers, in bytes (control groups of versions 2 and 1), above which processes are ended,
-# and what is used of each.
-LIMITS = (
-    (Path("/sys/fs/cgroup/memory.max"), Path("/sys/fs/cgroup/memory.current")),
-    (
-        Path("/sys/fs/cgroup/memory/memory.limit_in_bytes"),
-        Path("/sys/fs/cgroup/memory/memory.usage_in_bytes"),
-    ),
+MEMINFO, STATUS = Path("/proc/meminfo"), Path("/proc/self/status")
+GROUPS, OF_PROCESS = Path("/sys/fs/cgroup"), Path("/proc/self/cgroup")
+# Files of a control group, version 2 and version 1: its limit, above which its processes are ended, what it
+# uses, and the parts of this that are copies of files, which the system drops where memory is wanted.
+FILES = (
+    ("memory.max", "memory.current", ("inactive_file", "active_file")),
+    ("memory.limit_in_bytes", "memory.usage_in_bytes", ("total_inactive_file", "total_active_file")),
 )
 
 
 def peak_bytes() -> float:
     """Return the largest memory of this process so far, bytes; 0 where the system does not state it."""
-    if resource is None:
+    stated = _numbers_in(STATUS)
+    if "VmHWM:" in stated:  # that of getrusage is also what the process had that started this one
+        return stated["VmHWM:"] * 1024
+    if resource is None or sys.platform != "darwin":
         return 0.0
-    unit = 1.0 if sys.platform == "darwin" else 1024.0
-    return float(resource.getrusage(resource.RUSAGE_SELF).ru_maxrss) * unit
+    return float(resource.getrusage(resource.RUSAGE_SELF).ru_maxrss)
 
 
 def limit_bytes() -> float:
@@ -44,25 +45,48 @@ def limit_bytes() -> float:
         limit = resource.getrlimit(resource.RLIMIT_AS)[0]
         if limit != resource.RLIM_INFINITY:
             known = min(known, float(limit))
-    return min([known, *(_number_in(limit) for limit, _ in LIMITS)])
+    return min([known, *(limit for limit, _ in _groups())])
 
 
-def left_bytes() -> float:
-    """Return the memory that this process can still take, with swap, bytes; its limit if not known."""
-    left = limit_bytes()
-    with suppress(OSError, ValueError, KeyError, IndexError):
-        rows = (line.split() for line in MEMINFO.read_text("ascii").splitlines())
-        kib = {row[0]: int(row[1]) for row in rows}
-        left = min(left, (kib["MemAvailable:"] + kib["SwapFree:"]) * 1024.0)
-    for limit, used in LIMITS:
-        if math.isfinite(_number_in(limit)) and math.isfinite(_number_in(used)):
-            left = min(left, max(_number_in(limit) - _number_in(used), 0.0))
-    return left
+def within_bytes() -> float:
+    """Return what this process may have altogether: its memory and what is left, with swap, bytes.
+
+    Where the system does not state what is left, it is `limit_bytes`.
+    """
+    known = _numbers_in(MEMINFO)
+    own = _numbers_in(STATUS).get("VmRSS:", 0.0) * 1024
+    left = [limit - used for limit, used in _groups()]
+    if "MemAvailable:" in known:
+        left.append((known["MemAvailable:"] + known.get("SwapFree:", 0.0)) * 1024)
+    return min(limit_bytes(), own + max(min(left), 0.0)) if left else limit_bytes()
 
 
-def _number_in(file: Path) -> float:
-    """Return the number in a file; infinite if it does not exist, or contains "max"."""
-    try:
-        return float(file.read_text(encoding="ascii"))
-    except (OSError, ValueError):
-        return math.inf
+def _groups() -> list[tuple[float, float]]:
+    """Return limit and use of the control groups of this process that have a limit, bytes."""
+    folders = {GROUPS, GROUPS / "memory"}
+    with suppress(OSError, ValueError):
+        for line in OF_PROCESS.read_text("ascii").splitlines():
+            _, controllers, place = line.split(":", 2)
+            if controllers in ("", "memory"):
+                own = GROUPS / controllers / place.lstrip("/")
+                folders |= {own, *own.parents} - set(GROUPS.parents)
+    groups = []
+    for folder in sorted(folders):
+        for most, used, copies in FILES:
+            with suppress(OSError, ValueError):  # "max" is no limit
+                limit = float((folder / most).read_text("ascii"))
+                stated = _numbers_in(folder / "memory.stat")
+                used_bytes = float((folder / used).read_text("ascii"))
+                groups.append((limit, used_bytes - sum(stated.get(name, 0.0) for name in copies)))
+    return groups
+
+
+def _numbers_in(file: Path) -> dict[str, float]:
+    """Return the numbers behind the first words of the lines of a file; none if it cannot be read."""
+    numbers = {}
+    with suppress(OSError, UnicodeDecodeError):
+        for line in file.read_text("utf-8").splitlines():
+            words = line.split()
+            if len(words) > 1 and words[1].isdecimal():
+                numbers[words[0]] = float(words[1])
+    return numbers

@@ -74,7 +74,8 @@ def place_on_observations(network: Network, estimate: Estimate) -> Estimate:
             if np.linalg.det(R) > 0:
                 attitudes.append(R)
     count = len(attitudes)
-    tried = _Motions(start, np.ones(count), np.stack(attitudes), np.zeros((count, 3)))
+    observed, kinds = _observed_part(kinds, start)
+    tried = _Motions(observed, _size_of(start), np.ones(count), np.stack(attitudes), np.zeros((count, 3)))
     tried, cost = _fitted(kinds, tried, ROUGH_ROUNDS, scaled=scaled)
     best, cost = _fitted(kinds, tried.select(np.argsort(cost, kind="stable")[:BEST]), ROUNDS, scaled=scaled)
     k = int(np.argmin(cost))
@@ -105,16 +106,38 @@ def _about_centre(kinds: Sequence[TableKind], estimate: Estimate) -> tuple[Estim
     """
     centre = np.nanmean(estimate.points, axis=0)
     start = Similarity(1.0, np.eye(3), -centre).apply_estimate(estimate)
-    still = _Motions(start, np.ones(1), np.eye(3)[None], np.zeros((1, 3)))
-    rows, norm = [], 0.0
+    size = _size_of(start)
+    observed, kinds = _observed_part(kinds, start)
+    still = _Motions(observed, size, np.ones(1), np.eye(3)[None], np.zeros((1, 3)))
+    rows, norm, values = [], 0.0, still.values()
     for kind in kinds:
-        linear = _linearised(kind, still, kind.sigma.reshape(1, -1))
+        linear = _linearised(kind, still, values, kind.sigma.reshape(1, -1))
         root = _inverse_of(kind.sigma.ravel())
         rows.append(root[:, None] * linear.J[0])
         norm += linear.norm * float(root.max())
     by_motion = np.concatenate(rows)
-    by_motion[:, :3] *= still.size
-    return start, by_motion, MIN_FRACTION * still.size * norm
+    by_motion[:, :3] *= size
+    return start, by_motion, MIN_FRACTION * size * norm
+
+
+def _size_of(estimate: Estimate) -> float:
+    """Return the largest coordinate of the points."""
+    return float(np.nanmax(np.abs(estimate.points)))
+
+
+def _observed_part(kinds: Sequence[TableKind], estimate: Estimate) -> tuple[Estimate, list[TableKind]]:
+    """Return the points and photographs that observations involve, a few of many, and these renumbered."""
+    points, images = np.zeros(len(estimate.points), dtype=bool), np.zeros(len(estimate.position), dtype=bool)
+    for kind in kinds:
+        for of, at in kind.blocks():
+            (points if of == POINT else images)[at] = True
+    part = replace(
+        estimate,
+        points=estimate.points[points],
+        position=estimate.position[images],
+        rotation=estimate.rotation[images],
+    )
+    return part, [kind.renumbered(np.cumsum(points) - 1, np.cumsum(images) - 1) for kind in kinds]
 
 
 def _of_motions(network: Network, estimate: Estimate) -> list[TableKind]:
@@ -138,24 +161,20 @@ class _Motions(NamedTuple):
     """Positions, attitudes and scales of an estimate: X = scale R x + shift, a of them."""
 
     start: Estimate
+    size: float  # largest coordinate of all points, object unit
     scale: FloatArray  # (a,)
     rotation: FloatArray  # R, (a, 3, 3)
     shift: FloatArray  # (a, 3)
 
-    @property
-    def size(self) -> float:
-        """Largest coordinate of the points of the estimate."""
-        return float(np.nanmax(np.abs(self.start.points)))
-
     def select(self, at: IntArray) -> _Motions:
         """Return the motions of the given indices."""
-        return _Motions(self.start, self.scale[at], self.rotation[at], self.shift[at])
+        return _Motions(self.start, self.size, self.scale[at], self.rotation[at], self.shift[at])
 
     def then(self, step: FloatArray) -> _Motions:
         """Return the motions followed by a shift, a rotation vector and a change of ln(scale), (a, 7)."""
         R, scale = rotation_from_vector(step[:, 3:6]), np.exp(step[:, 6])
         shift = scale[:, None] * np.einsum("aij,aj->ai", R, self.shift) + step[:, :3]
-        return _Motions(self.start, scale * self.scale, R @ self.rotation, shift)
+        return _Motions(self.start, self.size, scale * self.scale, R @ self.rotation, shift)
 
     def values(self) -> AdjustedValues:
         """Return the values after all motions, one behind the other."""
@@ -186,8 +205,8 @@ def _fitted(
     """
     count, size = len(motions.scale), motions.size
     stated = [np.broadcast_to(kind.sigma.ravel(), (count, kind.sigma.size)) for kind in kinds]
-    sigma = stated
-    linear = [_linearised(kind, motions, of) for kind, of in zip(kinds, sigma, strict=True)]
+    sigma, values = stated, motions.values()
+    linear = [_linearised(kind, motions, values, of) for kind, of in zip(kinds, sigma, strict=True)]
     for _ in range(rounds):
         root = np.concatenate([_inverse_of(of) for of in sigma], axis=1)
         rows = root[:, :, None] * np.concatenate([of.J for of in linear], axis=1)
@@ -196,11 +215,16 @@ def _fitted(
         step = -np.einsum("aij,aj->ai", np.linalg.pinv(rows, rcond=1e-9), l)
         step /= np.maximum(np.abs(step[:, 3:]).max(axis=1, keepdims=True), MAX_STEP) / MAX_STEP
         motions = motions.then(step)
-        linear = [_linearised(kind, motions, of) for kind, of in zip(kinds, sigma, strict=True)]
+        values = motions.values()
+        linear = [_linearised(kind, motions, values, of) for kind, of in zip(kinds, sigma, strict=True)]
         away = [np.abs(of.difference) / by for of, by in zip(linear, stated, strict=True)]
         if np.abs(step / ([size] * 3 + [1.0] * 4)).max() < LAST_STEP:
             break
         sigma = [by * np.sqrt(np.maximum(over, 1.0)) for by, over in zip(stated, away, strict=True)]
+        linear = [  # weights decide on the derivatives of a group, whose parameters they eliminate
+            at if isinstance(kind, RowKind) else _linearised(kind, motions, values, of)
+            for kind, at, of in zip(kinds, linear, sigma, strict=True)
+        ]
     return motions, np.concatenate(away, axis=1).sum(axis=1)
 
 
@@ -210,12 +234,13 @@ def _inverse_of(sigma: FloatArray) -> FloatArray:
     return np.where(on, 1 / np.where(on, sigma, 1.0), 0.0)
 
 
-def _linearised(kind: TableKind, motions: _Motions, sigma: FloatArray) -> _ByMotions:
+def _linearised(kind: TableKind, motions: _Motions, values: AdjustedValues, sigma: FloatArray) -> _ByMotions:
     """Return observations after motions, with their standard deviations after each, (a, n d).
 
-    Rows are computed for all motions at once, as those of a network with as many copies of each point.
+    Rows are computed for all motions at once, as those of a network with as many copies of each point, which
+    have the values of `_Motions.values`.
     """
-    values, count = motions.values(), len(motions.scale)
+    count = len(motions.scale)
     n, m = len(motions.start.points), len(motions.start.position)
     copies = list[tuple[TableKind, AdjustedValues]]()
     if isinstance(kind, RowKind):

@@ -10,6 +10,7 @@ import pytest
 from scipy.spatial.distance import cdist
 
 from sfm.adjustment.covariance import change_datum, marginal_of, with_error_correlation
+from sfm.adjustment.engine import correlated
 from sfm.adjustment.engine.correlated import correlated_sum, largest_factor
 from sfm.adjustment.quality.correlations import (
     design_effect_of_neighbours,
@@ -155,11 +156,16 @@ def test_every_covariance_has_the_common_errors(
     assert none.covariance.points == pytest.approx(plain.covariance.points, rel=1e-9, abs=1e-15)
 
 
+@pytest.mark.parametrize("pairs_per_cell", [0.0, np.inf])
 @pytest.mark.parametrize("length_px", [20.0, 200.0])
 def test_no_function_of_errors_varies_more_than_the_bound(
-    unequal: tuple[Network, Estimate], length_px: float
+    unequal: tuple[Network, Estimate],
+    length_px: float,
+    pairs_per_cell: float,
+    monkeypatch: pytest.MonkeyPatch,
 ) -> None:
-    """The bound is above the largest eigenvalue of R, by less than a third of what R adds to I."""
+    """The bound is above the largest eigenvalue of R, by less than twice what common errors add to it."""
+    monkeypatch.setattr(correlated, "PAIRS_PER_CELL", pairs_per_cell)  # by cells, or exact sums
     network, truth = unequal
     a = adjusted(network, truth, in_common(network, 0.0, 1.0, seed_of("bound")))
     m, correlation = marginal_of(a), ErrorCorrelation(alone=0.9, common=0.1, length_px=length_px)
@@ -181,7 +187,7 @@ def test_errors_hardly_in_common_widen_every_covariance_a_little(scene: tuple[Ne
     correlation = ErrorCorrelation(alone=0.999, common=0.002, length_px=20.0)
     found = with_error_correlation(plain, correlation)
     m, points = marginal_of(found), np.array([7, 3, 200])
-    assert m.correlated is None and 1.0 < m.factor <= 1.1**2
+    assert m.correlated is None and 1.0 < m.variance_factor <= 1.1**2
     Z = m.influence.of(np.arange(12), points)
     o, relative = m.layout.observations, found.usual_px * m.influence.linear.whitening
     exact = correlated_sum(o.image, o.xy, relative, Z, correlation, np.ones(len(o.image), dtype=bool))
@@ -189,7 +195,7 @@ def test_errors_hardly_in_common_widen_every_covariance_a_little(scene: tuple[Ne
     ratio = np.diagonal(m.joint(np.arange(12), points)) / (found.sigma0**2 * np.diagonal(exact))
     assert ratio.min() >= 1 - 1e-9 and ratio.max() <= 1.1**2
     assert found.covariance.points[7] == pytest.approx(m.joint(np.zeros(0, dtype=int), points[:1]), rel=1e-6)
-    assert found.covariance.exterior == pytest.approx(m.factor * plain.covariance.exterior, rel=1e-9)
+    assert found.covariance.exterior == pytest.approx(m.variance_factor * plain.covariance.exterior, rel=1e-9)
     assert found.cofactors.points == pytest.approx(plain.cofactors.points, rel=1e-9)
 
 

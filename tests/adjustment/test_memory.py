@@ -90,7 +90,8 @@ def test_a_container_may_have_less_memory_than_the_computer(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     limit = tmp_path / "memory.max"
-    monkeypatch.setattr(system, "LIMITS", ((tmp_path / "missing", limit), (limit, tmp_path / "used")))
+    (tmp_path / "memory.current").write_text("1000000\n", encoding="ascii")
+    monkeypatch.setattr(system, "GROUPS", tmp_path)
     whole = memory.available_bytes()
     for said, expected in (("max\n", whole), ("2000000\n", memory.SHARE * 2e6), (f"{2**63}\n", whole)):
         limit.write_text(said, encoding="ascii")

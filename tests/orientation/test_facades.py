@@ -61,14 +61,14 @@ def test_a_part_that_cannot_be_reversed_excludes_the_reversal_of_many(monkeypatc
         return poor_photographs.reversed_growth(growth, empty, adjust, without)
 
     monkeypatch.setattr(sequence, "reversed_growth", counted)
-    monkeypatch.setattr(sequence, "MOST_REVERSED", 5)
+    monkeypatch.setattr(sequence, "TRIED_FIRST", 5)
     part = orient(network, start, refine=refine)
     assert left_out == [11]
     np.testing.assert_array_equal(part.estimate.position, whole.estimate.position)
 
 
 def test_a_part_that_can_be_reversed_decides_nothing(monkeypatch):
-    monkeypatch.setattr(sequence, "MOST_REVERSED", 4)
+    monkeypatch.setattr(sequence, "TRIED_FIRST", 4)
     oriented, worst, rms = facade_errors(10, 0.5, (6.0, 20.0))
     assert oriented == 8 and worst < 0.05 and rms < 0.15
 

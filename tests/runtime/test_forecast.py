@@ -161,11 +161,17 @@ def test_a_long_survey_is_announced_and_one_without_room_refused(monkeypatch: py
     assert announced(Work(("unheard of",), 10), [SMALL]) == ""
     long = Run(Work(("targets",), 500, 1.0), {"targets": 0.4, "adjustment": 7000.0, "report": 130.0}, 6600.0)
     expected = "expected: 2.0 h (adjustment 1.9 h, report 2 min) and 6.6 GB of memory"
-    monkeypatch.setattr(forecast, "left_bytes", lambda: 6e9)
+    monkeypatch.setattr(forecast, "within_bytes", lambda: 7e9)
     assert announced(long.work, [long]) == expected
-    monkeypatch.setattr(forecast, "left_bytes", lambda: 5e9)
-    with pytest.raises(KolinearError, match=r"needs about 6\.6 GB of memory, and 5\.0 GB are free"):
+    unknown = Run(Work(("other",), 500), long.seconds)  # of an earlier version
+    assert announced(unknown.work, [unknown]) == "expected: 2.0 h (adjustment 1.9 h, report 2 min)"
+    monkeypatch.setattr(forecast, "within_bytes", lambda: 6e9)
+    assert announced(long.work, [long]) == f"{expected}, of which 6.0 GB are there"
+    monkeypatch.setattr(forecast, "within_bytes", lambda: 5e9)
+    with pytest.raises(KolinearError, match=r"needs about 6\.6 GB of memory, and 5\.0 GB are there"):
         announced(long.work, [long])
+    far = Work(("targets",), 20_000, 1.0)  # nothing of this size is known, so that it is only told
+    assert announced(far, [long]).endswith("GB of memory, of which 5.0 GB are there")
 
 
 def test_a_stage_that_finds_more_to_do_says_nothing_of_the_others() -> None:

@@ -265,7 +265,7 @@ def test_many_photographs_get_another_camera_only_if_a_part_of_them_does(
     monkeypatch: pytest.MonkeyPatch, better: bool
 ) -> None:
     """Five of ten photographs are tried first; if none of five cameras fits them, the ten are not tried."""
-    monkeypatch.setattr(lost_photographs, "MOST_REVERSED", 5)
+    monkeypatch.setattr(lost_photographs, "TRIED_FIRST", 5)
     network, truth = make_network(seed_of("false minimum"), images=IMAGES, points=POINTS, noise_px=0.1)
     camera = replace(truth.cameras[0], free=np.ones_like(truth.cameras[0].free))
     p = camera.parameters.copy()
@@ -287,6 +287,31 @@ def test_many_photographs_get_another_camera_only_if_a_part_of_them_does(
     found, remarks = try_other_principal_distances(network, start, present, orient_from)
     assert remarks == () and tried == ([5, IMAGES] if better else [5] * 5)
     assert found is not None and found.rms_px == (0.1 if better else 5.0)
+
+
+@pytest.mark.parametrize("cameras", [1, 2])
+def test_a_part_that_fits_or_lacks_a_camera_excludes_no_other_c(
+    monkeypatch: pytest.MonkeyPatch, cameras: int
+) -> None:
+    """Five photographs that fit are best connected; those with a wrong c may be of another camera."""
+    monkeypatch.setattr(lost_photographs, "TRIED_FIRST", 5)
+    network, truth = make_network(seed_of("part that fits"), images=IMAGES, points=POINTS, noise_px=0.1)
+    seen, wrong = network.image_points, np.arange(IMAGES) >= 5
+    best = np.where(wrong[seen.image], seen.point % 4 > 0, True)  # fewer points in photographs of the wrong c
+    network = replace(network, image_points=seen.select(best), camera=wrong * (cameras - 1))
+    camera = replace(truth.cameras[0], free=np.ones_like(truth.cameras[0].free))
+    p = camera.parameters.copy()
+    p[camera.parts[0]] *= 1.02
+    of_camera = (camera, replace(camera.with_parameters(p), name="B"))[:cameras]
+    present = replace(orientation(network, replace(truth, cameras=of_camera)), rms_px=5.0)
+    tried = []
+
+    def orient_from(part: Network, values: Estimate) -> Orientation:
+        tried.append(len(part.images))
+        raise GeometryError("none")
+
+    try_other_principal_distances(network, empty_estimate(network, of_camera), present, orient_from)
+    assert tried == [IMAGES] * 5
 
 
 def _none(*_: object) -> Orientation:

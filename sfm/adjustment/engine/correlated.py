@@ -47,6 +47,7 @@ from sfm.runtime.compiling import compiled, kernel
 POINTS_AT_ONCE = 2000
 RUN = 256  # points whose effects on the reduced unknowns are taken together
 CELLS_PER_LENGTH, LENGTHS_SUMMED = 8, 20  # of the bound of common errors, per correlation length
+PAIRS_PER_CELL = 8  # pairs of image points whose distances take as long as a cell of the bound
 BYTES_AT_ONCE = 16_000_000  # bytes of the correlations held at a time
 
 
@@ -206,7 +207,9 @@ class _ErrorsInCommon:
         left = [self.order[np.isin(self.order, points)]]
         while left:
             part = left.pop()
-            if len(part) > 1 and 9 * len(part) * len(self._beside(part)) > 2 * self.errors.by_cameras.size:
+            scores = 3 * len(part) * len(self.influence.unknowns)  # of which there are five
+            taken = 9 * len(part) * len(self._beside(part)) + 5 * scores
+            if len(part) > 1 and taken > 2 * self.errors.by_cameras.size:
                 left += np.array_split(part, 2)
             elif len(part):
                 yield part
@@ -474,8 +477,8 @@ def largest_factor(
 ) -> float:
     """Return a bound of the factor of the variance of any function of errors, infinite beyond `most`.
 
-    It is the largest row sum of R, which no eigenvalue of R exceeds (Gershgorin's theorem). Distances are
-    those between the nearest parts of small cells, so that a convolution gives the sums of all cells.
+    It is the largest row sum of R, which no eigenvalue of R exceeds (Gershgorin's theorem). The distances of
+    many image points are those between the nearest parts of small cells, whose sums a convolution gives.
 
     Args:
         observations: k image points.
@@ -489,14 +492,25 @@ def largest_factor(
     from scipy.signal import fftconvolve  # importing takes half a second, and most commands never need it
 
     side_px, factor = correlation.length_px / CELLS_PER_LENGTH, 1.0
+    reach = LENGTHS_SUMMED * CELLS_PER_LENGTH
     o = observations
     for photograph in _photographs(o.image, o.xy, relative, correlation, which):
         if not len(photograph.rows):
             continue
-        cell = np.floor((photograph.xy - photograph.xy.min(axis=0)) / side_px).astype(np.int64)
+        squares = np.linalg.norm(photograph.relative, ord=2, axis=(1, 2)) ** 2
+        xy = photograph.xy - photograph.xy.min(axis=0)
+        if len(xy) ** 2 < PAIRS_PER_CELL * np.prod(xy.max(axis=0) / side_px + 2 * reach):
+            rows = np.arange(len(xy))
+            parts = np.array_split(rows, 1 + 8 * len(xy) ** 2 // BYTES_AT_ONCE)
+            exact = max(float((photograph.common(part) @ squares).max()) for part in parts)
+            factor = max(factor, correlation.alone + exact)
+            if factor > most:
+                return np.inf
+            continue
+        cell = np.floor(xy / side_px).astype(np.int64)
         weight = np.zeros(cell.max(axis=0) + 1)
-        np.add.at(weight, tuple(cell.T), np.linalg.norm(photograph.relative, ord=2, axis=(1, 2)) ** 2)
-        beside = np.arange(-LENGTHS_SUMMED * CELLS_PER_LENGTH, LENGTHS_SUMMED * CELLS_PER_LENGTH + 1)
+        np.add.at(weight, tuple(cell.T), squares)
+        beside = np.arange(-reach, reach + 1)
         apart = np.maximum(np.abs(beside) - 1, 0) / CELLS_PER_LENGTH  # in correlation lengths
         shared = np.exp(-np.hypot(apart[:, None], apart))
         sums = fftconvolve(weight, shared, mode="full")

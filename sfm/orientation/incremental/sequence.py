@@ -61,7 +61,7 @@ FINAL_TOLERANCE_PX = 4.0  # no image point is excluded below this here; the adju
 # of 9 photographs with 25 % wrong matches, growing again corrected one, of which 5 were oriented, and none
 # with more than this share; it takes three times as long.
 MOST = 0.75
-MOST_REVERSED = 60  # photographs of the part on which a reversal in depth, or another c, is tried first
+TRIED_FIRST = 60  # photographs of the part on which a reversal in depth, or another c, is tried first
 MIN_RIVALS = 3  # oriented photographs; with two, other knowledge decides, see `best_start`
 GROWTH = 1.25  # growth in the number of photographs after which the network is adjusted again
 MAX_ROUNDS = 200
@@ -275,7 +275,7 @@ def _best_of_rivals(
     split = growth.dropped.any() and oriented.mean() < MOST
     loose = bool((growth.tolerance_px > final_tolerance_px).any() or split)
     if not loose:  # a part that cannot be reversed excludes that of the whole
-        others = oriented & ~best_connected(growth.network, growth.estimate, MOST_REVERSED)
+        others = oriented & ~best_connected(growth.network, growth.estimate, TRIED_FIRST)
         if others.any():
             part = reversed_growth(growth, begin(values, 1.0), refine, others)
             if not casts_doubt(growth, part):

@@ -247,6 +247,7 @@ def precision_figure(shown: PlotData) -> Figure:
         xy = points[worst_last][:, [across, up]]
         seen = _uncovered(xy)
         drawn = panel.scatter(*xy[seen].T, c=shown.sigma[worst_last[seen]], s=14, cmap=SHADES)
+        drawn.set_clim(*shown.sigma[worst_last[[0, -1]]] if len(worst_last) else (None, None))
         label = f"sigma [{_plain(shown.sigma_unit)}]"
         figure.colorbar(drawn, ax=panel, label=label, shrink=0.85, fraction=BAR_FRACTION)
         _show_object(panel, labels[across], labels[up], shown.unit, title)

@@ -53,7 +53,7 @@ from sfm.model.solution import Solution
 from sfm.orientation.image_rays import image_tangents, rays_of
 from sfm.orientation.incremental.growth import MIN_SHARE, TOLERANCE_FACTOR, residual_lengths
 from sfm.orientation.incremental.poor_photographs import best_connected
-from sfm.orientation.incremental.sequence import MIN_POINTS, MOST_REVERSED, Orientation
+from sfm.orientation.incremental.sequence import MIN_POINTS, TRIED_FIRST, Orientation
 from sfm.survey.diagnosis.photograph_cameras import MAJORITY_FRACTION
 
 MIN_RAYS = 2
@@ -242,10 +242,23 @@ def _part_excludes_another_c(
     orient: Callable[[Network, Estimate], Orientation],
     false_alarm: float,
 ) -> bool:
-    """Return whether no other principal distance is likelier for the best connected of many photographs."""
-    images = best_connected(network, orientation.estimate, MOST_REVERSED)
-    if images.sum() == orientation.estimate.oriented.sum():
+    """Return whether no other principal distance is likelier for the best connected of many photographs.
+
+    A part that fits as it is, or that lacks a camera, says nothing of the others.
+    """
+    oriented = orientation.estimate.oriented
+    images = best_connected(network, orientation.estimate, TRIED_FIRST)
+    if len(np.unique(network.camera[images])) < len(np.unique(network.camera[oriented])):
         return False
+    if images.sum() == oriented.sum():
+        return False
+    tried = 0
+
+    def orient_part(part: Network, start: Estimate) -> Orientation:
+        nonlocal tried
+        tried += 1
+        return orient(part, start)
+
     rows = images[network.image_points.image]
     points = _count_rays(network, rows) >= MIN_RAYS
     rows &= points[network.image_points.point]
@@ -254,7 +267,8 @@ def _part_excludes_another_c(
     fits = orientation.fits[rows]
     square = float((residual_lengths(part, of_part)[fits] ** 2).mean()) if fits.any() else np.inf
     before = replace(orientation, estimate=of_part, fits=fits, failures=(), rms_px=math.sqrt(square / 2))
-    return try_other_principal_distances(part, start, before, orient, false_alarm)[0] is before
+    best, _ = try_other_principal_distances(part, start, before, orient_part, false_alarm)
+    return tried > 0 and best is before
 
 
 def _count_oriented(orientation: Orientation | None) -> int:
