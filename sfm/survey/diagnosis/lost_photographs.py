@@ -244,7 +244,8 @@ def _part_excludes_another_c(
 ) -> bool:
     """Return whether no other principal distance is likelier for the best connected of many photographs.
 
-    A part that fits as it is, or that lacks a camera, says nothing of the others.
+    A wrong one would not fit them either, as photographs of a camera share it. A part without a camera says
+    nothing of that one.
     """
     oriented = orientation.estimate.oriented
     images = best_connected(network, orientation.estimate, TRIED_FIRST)
@@ -252,13 +253,6 @@ def _part_excludes_another_c(
         return False
     if images.sum() == oriented.sum():
         return False
-    tried = 0
-
-    def orient_part(part: Network, start: Estimate) -> Orientation:
-        nonlocal tried
-        tried += 1
-        return orient(part, start)
-
     rows = images[network.image_points.image]
     points = _count_rays(network, rows) >= MIN_RAYS
     rows &= points[network.image_points.point]
@@ -267,8 +261,7 @@ def _part_excludes_another_c(
     fits = orientation.fits[rows]
     square = float((residual_lengths(part, of_part)[fits] ** 2).mean()) if fits.any() else np.inf
     before = replace(orientation, estimate=of_part, fits=fits, failures=(), rms_px=math.sqrt(square / 2))
-    best, _ = try_other_principal_distances(part, start, before, orient_part, false_alarm)
-    return tried > 0 and best is before
+    return try_other_principal_distances(part, start, before, orient, false_alarm)[0] is before
 
 
 def _count_oriented(orientation: Orientation | None) -> int:
