@@ -26,7 +26,7 @@ from pathlib import Path
 import numpy as np
 
 from benchmarks.networks import SIZE_PX, photographed, shared_camera
-from benchmarks.textured import covariance_on_centres
+from benchmarks.textured import covariance_on_centres, errors_before, joint_distance
 from sfm.model.conventions import FloatArray, IntArray
 from sfm.model.estimate import Estimate
 from sfm.model.network import Network
@@ -116,13 +116,11 @@ def _run(network: Network, truth: Estimate) -> None:
     moved = fit_similarity(a.estimate.position, truth.position[of_truth])
     placed = moved.apply_estimate(a.estimate)
     m, centres = len(on), placed.position - truth.position[of_truth]
-    turn = truth.rotation[of_truth].transpose(0, 2, 1) @ placed.rotation
-    turns = np.column_stack([turn[:, 2, 1], turn[:, 0, 2], turn[:, 1, 0]])
-    errors = np.column_stack([centres @ moved.rotation / moved.scale, turns]).ravel()
+    errors = errors_before(moved, centres, truth.rotation[of_truth], placed.rotation)
     covariance = covariance_on_centres(a)
-    sigma = np.sqrt(np.diagonal(covariance))
+    distance = joint_distance(errors, covariance)
+    errors, sigma = errors.ravel(), np.sqrt(np.diagonal(covariance))
     z = errors / sigma
-    distance = float(z @ np.linalg.pinv(covariance / np.outer(sigma, sigma), rcond=1e-10) @ z) / (6 * m - 7)
     order = np.argsort(of_truth)
     closing = np.zeros((3, 6 * m))
     closing[:, 6 * order[-1] : 6 * order[-1] + 3] = np.eye(3)

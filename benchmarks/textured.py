@@ -19,7 +19,7 @@ from pathlib import Path
 
 import numpy as np
 
-from adapters.colmap.mapper import map_photographs
+from adapters.colmap.mapper import MapperBaseline, map_photographs
 from benchmarks.textured_scenes import RIPPLES, TexturedScene, render_scene, textured_scene
 from sfm.adjustment.covariance import marginal_of
 from sfm.adjustment.result import Adjustment
@@ -27,7 +27,7 @@ from sfm.comparison.solutions import rotation_angle_deg
 from sfm.model.conventions import FloatArray
 from sfm.model.estimate import Estimate
 from sfm.model.network import Network
-from sfm.model.similarity import fit_similarity
+from sfm.model.similarity import Similarity, fit_similarity
 from sfm.pipeline import run_survey
 from sfm.products.refining.refinement import refine_model
 from sfm.survey.inputs.survey import read_survey
@@ -64,7 +64,7 @@ def main() -> None:
             if "colmap" in arguments.methods:
                 of_scene += _colmap(scene, folder)
             if "colmap-global" in arguments.methods:
-                of_scene.append(_colmap_global(scene, folder))
+                of_scene.append(_colmap_alone(scene, folder, at_once=True)[1])
             seconds.append(of_scene)
         if len(arguments.photographs) > 1:
             power = np.polyfit(np.log(arguments.photographs), np.log(seconds), 1)[0]
@@ -90,26 +90,26 @@ def _kolinear(scene: TexturedScene, folder: Path, jobs: int) -> float:
 
 def _colmap(scene: TexturedScene, folder: Path) -> list[float]:
     """Run COLMAP's pipeline and refine its model; print the errors and return the times of both."""
+    mapped, seconds = _colmap_alone(scene, folder)
     begun = time.process_time()
-    names = tuple(sorted(path.name for path in folder.glob("*.png")))
-    mapped = map_photographs(folder, (names,))
-    seconds = time.process_time() - begun
-    _print(scene, folder.name, "COLMAP", mapped.network, mapped.estimate, seconds)
     refined = refine_model(mapped.network, mapped.estimate, folder)
     a = refined.adjustment
-    whole = time.process_time() - begun
+    whole = seconds + time.process_time() - begun
     _print(scene, folder.name, "COLMAP + refine", a.network, a.estimate, whole, a)
     return [seconds, whole]
 
 
-def _colmap_global(scene: TexturedScene, folder: Path) -> float:
-    """Run COLMAP's pipeline with its global mapper, print its errors and return its processor time."""
+def _colmap_alone(
+    scene: TexturedScene, folder: Path, *, at_once: bool = False
+) -> tuple[MapperBaseline, float]:
+    """Run COLMAP's pipeline, print its errors and return its model and its processor time."""
     begun = time.process_time()
     names = tuple(sorted(path.name for path in folder.glob("*.png")))
-    mapped = map_photographs(folder, (names,), at_once=True)
+    mapped = map_photographs(folder, (names,), at_once=at_once)
     seconds = time.process_time() - begun
-    _print(scene, folder.name, "COLMAP, global", mapped.network, mapped.estimate, seconds)
-    return seconds
+    method = "COLMAP, global" if at_once else "COLMAP"
+    _print(scene, folder.name, method, mapped.network, mapped.estimate, seconds)
+    return mapped, seconds
 
 
 def _print(
@@ -132,17 +132,11 @@ def _print(
     centre = float(np.sqrt((centres**2).sum(axis=1).mean()))
     predicted, distance = np.nan, np.nan
     if adjustment is not None:
-        turn = scene.rotation[of_truth].transpose(0, 2, 1) @ placed.rotation[on]
-        turns = np.column_stack([turn[:, 2, 1], turn[:, 0, 2], turn[:, 1, 0]])  # small angles, image axes
-        errors = np.column_stack([centres @ moved.rotation / moved.scale, turns])
+        errors = errors_before(moved, centres, scene.rotation[of_truth], placed.rotation[on])
         covariance = covariance_on_centres(adjustment)
-        m = len(on)
-        predicted = moved.scale * float(
-            np.sqrt(np.diagonal(covariance).reshape(m, 6)[:, :3].sum(axis=1).mean())
-        )
-        inverse = np.linalg.pinv(covariance / np.outer(scale := _units(covariance), scale), rcond=1e-10)
-        z = errors.ravel() / scale
-        distance = float(z @ inverse @ z) / (6 * m - 7)
+        variances = np.diagonal(covariance).reshape(-1, 6)[:, :3]
+        predicted = moved.scale * float(np.sqrt(variances.sum(axis=1).mean()))
+        distance = joint_distance(errors, covariance)
     print(
         f"{name:<17}{method:<17}{len(on):>3}/{len(scene.position):<3}{len(network.points):>7}"
         f"{1000 * centre:>12.4f}"
@@ -152,9 +146,30 @@ def _print(
     )
 
 
-def _units(covariance: FloatArray) -> FloatArray:
-    """Return standard deviations, which give lengths and angles the same weight when rank is determined."""
-    return np.sqrt(np.diagonal(covariance))
+def errors_before(
+    moved: Similarity, centres: FloatArray, true_rotation: FloatArray, rotation: FloatArray
+) -> FloatArray:
+    """Return errors of X0 and small rotations about the image axes in the frame of the estimate, (m, 6).
+
+    Args:
+        moved: similarity onto the truth.
+        centres: errors of the centres after it, (m, 3).
+        true_rotation: true rotations, (m, 3, 3).
+        rotation: those of the estimate after it, (m, 3, 3).
+    """
+    turn = true_rotation.transpose(0, 2, 1) @ rotation
+    turns = np.column_stack([turn[:, 2, 1], turn[:, 0, 2], turn[:, 1, 0]])
+    return np.column_stack([centres @ moved.rotation / moved.scale, turns])
+
+
+def joint_distance(errors: FloatArray, covariance: FloatArray) -> float:
+    """Return the squared Mahalanobis distance of errors, (m, 6), per degree of freedom."""
+    scale = np.sqrt(
+        np.diagonal(covariance)
+    )  # lengths and angles have the same weight when rank is determined
+    inverse = np.linalg.pinv(covariance / np.outer(scale, scale), rcond=1e-10)
+    z = errors.ravel() / scale
+    return float(z @ inverse @ z) / (errors.size - 7)
 
 
 def covariance_on_centres(adjustment: Adjustment) -> FloatArray:

@@ -114,8 +114,14 @@ def longest_residual(adjustment: Adjustment) -> LongestResidual:
 
 def root_mean_square(values: FloatArray) -> float:
     """Return the root mean square of the known values, NaN if none is known."""
-    known = values[np.isfinite(values)]
-    return float(np.sqrt(np.mean(known**2))) if known.size else float("nan")
+    return float(root_mean_squares_of_rows(values.reshape(1, -1))[0])
+
+
+def root_mean_squares_of_rows(values: FloatArray) -> FloatArray:
+    """Return the root mean square of the known values of each row, (n, d), NaN where none is known, (n,)."""
+    known = np.isfinite(values)
+    squares, count = (np.where(known, values, 0.0) ** 2).sum(axis=1), known.sum(axis=1)
+    return np.asarray(np.sqrt(np.where(count > 0, squares, np.nan) / np.maximum(count, 1)))
 
 
 def standard_deviations(covariance: FloatArray) -> FloatArray:

@@ -38,6 +38,7 @@ from sfm.files.open_folders import disk_errors, make_folder, open_regular_file, 
 from sfm.files.plain_text import Content, Name, or_none, read_json
 from sfm.files.whole_files import whole_folder
 from sfm.judgement.calibrated_cameras import projection_of
+from sfm.judgement.checks import root_mean_squares_of_rows
 from sfm.judgement.survey_result import StageTime, SurveyResult
 from sfm.model.conventions import AnyArray
 from sfm.model.display import counted, listed
@@ -206,11 +207,7 @@ def plot_data(findings: Findings) -> PlotData:
     adjustment, interior, geometry = findings.result.adjustment, findings.interior, findings.geometry
     network, estimate, used = adjustment.network, adjustment.estimate, ~adjustment.rejected
     seen = network.image_points.select(used)
-    of_points = adjusted_sigmas(adjustment.covariance.points)
-    known = np.isfinite(of_points)
-    squares = np.where(known, of_points, 0.0) ** 2
-    with np.errstate(invalid="ignore"):
-        sigma = np.sqrt(squares.sum(axis=1) / known.sum(axis=1))  # NaN where none is known
+    sigma = root_mean_squares_of_rows(adjusted_sigmas(adjustment.covariance.points))
     factor, unit = finer_unit(findings.result.length_unit, float(findings.precision.largest[3]))
     # Baarda (1968): sigma of v = sigma0 * sigma * sqrt(r) with the redundancy number r
     variance = np.einsum("kii->ki", adjustment.image_covariance[used])

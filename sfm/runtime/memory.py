@@ -20,10 +20,10 @@ MEMINFO, STATUS = Path("/proc/meminfo"), Path("/proc/self/status")
 GROUPS, OF_PROCESS = Path("/sys/fs/cgroup"), Path("/proc/self/cgroup")
 # Files of a control group, version 2 and version 1: its limit, above which its processes are ended, what it
 # uses, and the parts of this that are copies of files, which the system drops where memory is wanted.
-FILES = (
-    ("memory.max", "memory.current", ("inactive_file", "active_file")),
-    ("memory.limit_in_bytes", "memory.usage_in_bytes", ("total_inactive_file", "total_active_file")),
-)
+FILES = {
+    "memory.max": ("memory.current", ("inactive_file", "active_file")),
+    "memory.limit_in_bytes": ("memory.usage_in_bytes", ("total_inactive_file", "total_active_file")),
+}
 
 
 def peak_bytes() -> float:
@@ -45,7 +45,7 @@ def limit_bytes() -> float:
         limit = resource.getrlimit(resource.RLIMIT_AS)[0]
         if limit != resource.RLIM_INFINITY:
             known = min(known, float(limit))
-    return min([known, *(limit for limit, _ in _groups())])
+    return min([known, *_limits().values()])
 
 
 def within_bytes() -> float:
@@ -55,14 +55,14 @@ def within_bytes() -> float:
     """
     known = _numbers_in(MEMINFO)
     own = _numbers_in(STATUS).get("VmRSS:", 0.0) * 1024
-    left = [limit - used for limit, used in _groups()]
+    left = [limit - _used_of(file) for file, limit in _limits().items()]
     if "MemAvailable:" in known:
         left.append((known["MemAvailable:"] + known.get("SwapFree:", 0.0)) * 1024)
     return min(limit_bytes(), own + max(min(left), 0.0)) if left else limit_bytes()
 
 
-def _groups() -> list[tuple[float, float]]:
-    """Return limit and use of the control groups of this process that have a limit, bytes."""
+def _limits() -> dict[Path, float]:
+    """Return the limits of the control groups of this process, bytes, by their files."""
     folders = {GROUPS, GROUPS / "memory"}
     with suppress(OSError, ValueError):
         for line in OF_PROCESS.read_text("ascii").splitlines():
@@ -70,15 +70,21 @@ def _groups() -> list[tuple[float, float]]:
             if controllers in ("", "memory"):
                 own = GROUPS / controllers / place.lstrip("/")
                 folders |= {own, *own.parents} - set(GROUPS.parents)
-    groups = []
-    for folder in sorted(folders):
-        for most, used, copies in FILES:
-            with suppress(OSError, ValueError):  # "max" is no limit
-                limit = float((folder / most).read_text("ascii"))
-                stated = _numbers_in(folder / "memory.stat")
-                used_bytes = float((folder / used).read_text("ascii"))
-                groups.append((limit, used_bytes - sum(stated.get(name, 0.0) for name in copies)))
-    return groups
+    limits = {}
+    for file in (folder / most for folder in folders for most in FILES):
+        with suppress(OSError, ValueError):  # "max" is no limit
+            limits[file] = float(file.read_text("ascii"))
+    return limits
+
+
+def _used_of(limit: Path) -> float:
+    """Return what a control group uses, bytes, by the file of its limit; nothing where it is not stated."""
+    used, copies = FILES[limit.name]
+    stated = _numbers_in(limit.with_name("memory.stat"))
+    with suppress(OSError, ValueError):
+        whole = float(limit.with_name(used).read_text("ascii"))
+        return whole - sum(stated.get(name, 0.0) for name in copies)
+    return 0.0
 
 
 def _numbers_in(file: Path) -> dict[str, float]:
