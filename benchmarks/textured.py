@@ -3,11 +3,13 @@
     python -m benchmarks.textured --photographs 20 60 --roughness smooth medium rough
     python -m benchmarks.textured --photographs 15 30 60 120 --roughness medium --methods kolinear
     python -m benchmarks.textured --photographs 25 --finer 3 --roughness medium --methods kolinear
+    python -m benchmarks.textured --photographs 60 250 1000 --layout block --finer 0.625 --roughness medium
 
 For each scene, the following is printed: the RMS errors of centres and rotations after a similarity onto the
 truth, their prediction by the result in the same datum, the joint squared Mahalanobis distance of centres and
 rotations per degree of freedom, and the processor time. With several numbers of photographs, the exponent of
-the growth of time is printed too. Scenes are rendered into a folder (--work) unless they exist there.
+the growth of time is printed too. Of a block, COLMAP is told the pairs that overlap. Scenes are rendered into
+a folder (--work) unless they exist there.
 """
 
 from __future__ import annotations
@@ -20,7 +22,15 @@ from pathlib import Path
 import numpy as np
 
 from adapters.colmap.mapper import MapperBaseline, map_photographs
-from benchmarks.textured_scenes import RIPPLES, TexturedScene, render_scene, textured_scene
+from benchmarks.textured_scenes import (
+    LAYOUTS,
+    RIPPLES,
+    TexturedScene,
+    overlapping,
+    photograph_name,
+    render_scene,
+    textured_scene,
+)
 from sfm.adjustment.covariance import marginal_of
 from sfm.adjustment.result import Adjustment
 from sfm.comparison.solutions import rotation_angle_deg
@@ -43,21 +53,23 @@ def main() -> None:
     """Run the command line."""
     parser = argparse.ArgumentParser(description=__doc__.split("\n")[0] if __doc__ else "")
     parser.add_argument("--photographs", type=int, nargs="+", default=[20])
-    parser.add_argument("--finer", type=int, default=1, help="pixels along each of 1024 x 768")
+    parser.add_argument("--finer", type=float, default=1.0, help="pixels along each of 1024 x 768")
     parser.add_argument("--jobs", type=int, default=1, help="photographs processed at a time")
+    parser.add_argument("--layout", choices=LAYOUTS, default="dome", help="see benchmarks/textured_scenes.py")
     parser.add_argument("--roughness", nargs="+", default=list(RIPPLES), choices=list(RIPPLES))
     parser.add_argument("--methods", nargs="+", default=METHODS, choices=METHODS)
     parser.add_argument("--work", type=Path, default=Path("build/textured_scenes"))
     arguments = parser.parse_args()
     print(HEAD)
-    finer = "" if arguments.finer == 1 else f"x{arguments.finer}"
+    finer = "" if arguments.finer == 1 else f"x{arguments.finer:g}"
+    block = "" if arguments.layout == "dome" else "block"
     for roughness in arguments.roughness:
         seconds: list[list[float]] = []
         for photographs in arguments.photographs:
-            folder = arguments.work / f"{roughness}{photographs}{finer}"
-            scene = textured_scene(roughness, photographs, arguments.finer)
+            folder = arguments.work / f"{roughness}{block}{photographs}{finer}"
+            scene = textured_scene(roughness, photographs, arguments.finer, arguments.layout)
             if not (folder / "survey.toml").is_file():
-                render_scene(folder, roughness, photographs, arguments.finer)
+                render_scene(folder, roughness, photographs, arguments.finer, arguments.layout)
             of_scene: list[float] = []
             if "kolinear" in arguments.methods:
                 of_scene.append(_kolinear(scene, folder, arguments.jobs))
@@ -104,8 +116,9 @@ def _colmap_alone(
 ) -> tuple[MapperBaseline, float]:
     """Run COLMAP's pipeline, print its errors and return its model and its processor time."""
     begun = time.process_time()
-    names = tuple(sorted(path.name for path in folder.glob("*.png")))
-    mapped = map_photographs(folder, (names,), at_once=at_once)
+    names = tuple(photograph_name(i) for i in range(len(scene.position)))
+    pairs = [(names[i], names[j]) for i, j in overlapping(scene)] if scene.layout == "block" else None
+    mapped = map_photographs(folder, (names,), at_once=at_once, pairs=pairs)
     seconds = time.process_time() - begun
     method = "COLMAP, global" if at_once else "COLMAP"
     _print(scene, folder.name, method, mapped.network, mapped.estimate, seconds)
@@ -122,7 +135,7 @@ def _print(
     adjustment: Adjustment | None = None,
 ) -> None:
     """Print one row of the table."""
-    truth = {f"surface_{i + 1:03d}.png": i for i in range(len(scene.position))}
+    truth = {photograph_name(i): i for i in range(len(scene.position))}
     on = np.flatnonzero(estimate.oriented)
     of_truth = [truth[network.images[i]] for i in on]
     moved = fit_similarity(estimate.position[on], scene.position[of_truth])

@@ -1,11 +1,14 @@
 """Renders photographs of a textured surface of three roughnesses, with the true orientation.
 
     python -m benchmarks.textured_scenes smooth 20 build/smooth20
+    python -m benchmarks.textured_scenes medium 1000 build/block1000 block 0.625
 
-The surface is a square of 2.4 m with hills and ripples. The ripples are absent, 4 mm high and 0.15 m long, or
-8 mm high and 0.08 m long. The camera moves around the surface on a dome at several elevations; every other
-photograph is rotated by 90 degrees. Every pixel is the mean of rays over its area, blurred and with noise, as
-in datasets/textured.
+The surface has hills and ripples. The ripples are absent, 4 mm high and 0.15 m long, or 8 mm high and 0.08 m
+long. On a dome, the camera moves around a square of 2.4 m at several elevations, and every photograph shows
+most of it. In a block, the photographs look at the nodes of a grid, tilted by 20 degrees in turn in four
+directions, and the surface is as large as their number asks for: each point is in about 13 photographs. Every
+other photograph is rotated by 90 degrees. Every pixel is the mean of rays over its area, blurred and with
+noise, as in datasets/textured.
 """
 
 from __future__ import annotations
@@ -16,10 +19,11 @@ from pathlib import Path
 
 import cv2
 import numpy as np
+from scipy.spatial import cKDTree
 
 from datasets.textured import render
 from sfm.model.camera import Camera, camera_from_values, tangents_from_pixel
-from sfm.model.conventions import AnyArray, FloatArray
+from sfm.model.conventions import AnyArray, FloatArray, IntArray
 from sfm.runtime.compiling import compiled
 
 RIPPLES = {"smooth": (0.0, 1.0), "medium": (0.004, 0.15), "rough": (0.008, 0.08)}  # height and length, m
@@ -30,6 +34,11 @@ DISTANCE_M = 1.7
 ELEVATIONS_DEG = (48.0, 58.0, 70.0)
 MARCH, BISECT = 40, 12  # steps along a ray through the slab around the surface; bisections in a step
 SLAB_M = 0.2  # half the height of that slab
+COARSE = 8  # pixels between the rays of a block that are followed from outside; the others start between them
+NODES_M = (0.36, 0.28)  # between the nodes of a block, along and across its rows
+TILT_DEG = 20.0  # of the photographs of a block
+OVERLAP_M = 0.9  # photographs that look at points nearer to each other share a third of what they show
+LAYOUTS = ("dome", "block")
 SURVEY = """[survey]
 name = "{name}"
 unit = "m"
@@ -60,27 +69,47 @@ class TexturedScene:
     position: FloatArray  # projection centres, m, (m, 3)
     rotation: FloatArray  # (m, 3, 3)
     camera: Camera
+    layout: str = "dome"  # dome | block
 
 
-def textured_scene(roughness: str, photographs: int, finer: int = 1) -> TexturedScene:
+def textured_scene(
+    roughness: str, photographs: int, finer: float = 1.0, layout: str = "dome"
+) -> TexturedScene:
     """Return the scene with its true orientation; pixels are `finer` times smaller than usual."""
+    towards, outward = _dome(photographs) if layout == "dome" else _block(photographs)
     position, rotation = [], []
     for i in range(photographs):
-        azimuth = 2 * np.pi * i / photographs * (1 if photographs < 40 else 2)
-        elevation = np.radians(ELEVATIONS_DEG[i % 3])
-        outward = np.array(
-            [np.cos(elevation) * np.cos(azimuth), np.cos(elevation) * np.sin(azimuth), np.sin(elevation)]
-        )
-        x = np.array([-np.sin(azimuth), np.cos(azimuth), 0.0])
+        x = np.cross([0.0, 0.0, 1.0], outward[i])
+        x /= np.linalg.norm(x)
         roll = np.radians(90 * (i // 2 % 2))
-        right = np.cos(roll) * x + np.sin(roll) * np.cross(outward, x)
-        position.append((DISTANCE_M + 0.08 * (i % 4)) * outward)
-        rotation.append(np.column_stack([right, np.cross(outward, right), outward]))
+        right = np.cos(roll) * x + np.sin(roll) * np.cross(outward[i], x)
+        position.append(towards[i] + (DISTANCE_M + 0.08 * (i % 4)) * outward[i])
+        rotation.append(np.column_stack([right, np.cross(outward[i], right), outward[i]]))
     centre = (("cx", 515.0 * finer), ("cy", 380.0 * finer))
     values = (("k1", -0.05), ("k2", 0.02), ("p1", 2e-4), ("p2", -1e-4), *centre)
-    size, pixel = (SIZE_PX[0] * finer, SIZE_PX[1] * finer), PIXEL_MM / finer
+    size, pixel = (round(SIZE_PX[0] * finer), round(SIZE_PX[1] * finer)), PIXEL_MM / finer
     camera = camera_from_values("lens", "opencv", size, (pixel, pixel), c_mm=C_MM, values=values)
-    return TexturedScene(roughness, np.array(position), np.array(rotation), camera)
+    return TexturedScene(roughness, np.array(position), np.array(rotation), camera, layout)
+
+
+def _dome(photographs: int) -> tuple[FloatArray, FloatArray]:
+    """Return the points that photographs around a surface look at and the directions from there, (m, 3)."""
+    i = np.arange(photographs)
+    azimuth = 2 * np.pi * i / photographs * (1 if photographs < 40 else 2)
+    elevation = np.radians(ELEVATIONS_DEG)[i % 3]
+    level = np.column_stack([np.cos(azimuth), np.sin(azimuth)]) * np.cos(elevation)[:, None]
+    return np.zeros((photographs, 3)), np.column_stack([level, np.sin(elevation)])
+
+
+def _block(photographs: int) -> tuple[FloatArray, FloatArray]:
+    """Return the nodes that photographs of a block look at and the directions from there, (m, 3)."""
+    rows = max(round(np.sqrt(photographs / 1.6)), 1)
+    row, column = np.divmod(np.arange(photographs), -(-photographs // rows))
+    nodes = np.column_stack([column * NODES_M[0], row * NODES_M[1], np.zeros(photographs)])
+    azimuth, tilt = np.pi / 2 * ((column + 2 * row) % 4) + np.pi / 4, np.radians(TILT_DEG)
+    level = np.column_stack([np.cos(azimuth), np.sin(azimuth)]) * np.sin(tilt)
+    middle = (nodes.max(axis=0) + nodes.min(axis=0)) / 2
+    return nodes - middle, np.column_stack([level, np.full(photographs, np.cos(tilt))])
 
 
 @compiled
@@ -137,28 +166,43 @@ def _nearby_meeting(
         length[k] = t
 
 
-def intensities(scene: TexturedScene, index: int, skin: AnyArray) -> AnyArray:
+def scene_texture(scene: TexturedScene, finer: float = 1.0) -> tuple[AnyArray, float]:
+    """Return the reflectance of the surface with the origin in its middle, and the side of a texel, m."""
+    if scene.layout == "dome":
+        return render.texture(), render.TEXEL_M
+    reach = np.abs(scene.position[:, :2]).max(axis=0) + DISTANCE_M
+    texel = render.TEXEL_M / finer
+    return render.texture(size_m=(2 * float(reach[0]), 2 * float(reach[1])), texel_m=texel), texel
+
+
+def intensities(
+    scene: TexturedScene, index: int, skin: AnyArray, texel_m: float = render.TEXEL_M
+) -> AnyArray:
     """Return one photograph without noise, float32, 0 to 255."""
     width, rows = scene.camera.size_px
     centre, (tall, long) = scene.position[index], RIPPLES[scene.roughness]
-    y, x = np.mgrid[0:rows, 0:width]
-    grid = np.column_stack([x.ravel(), y.ravel()]).astype(float)
-
-    def rays(offset: tuple[float, float]) -> FloatArray:
-        uv = tangents_from_pixel(scene.camera, grid + offset)
-        return np.ascontiguousarray(np.column_stack([uv, -np.ones(len(uv))]) @ scene.rotation[index].T)
-
-    middle = np.empty(len(grid))
-    _first_meeting(tall, long, centre, rays((0.0, 0.0)), middle)
+    coarse = COARSE if scene.layout == "block" else 1
+    start = np.empty((rows // coarse) * (width // coarse))
+    _first_meeting(tall, long, centre, _rays(scene, index, ((coarse - 1) / 2,) * 2, coarse), start)
+    start = cv2.resize(
+        start.reshape(rows // coarse, -1), (width, rows), interpolation=cv2.INTER_LINEAR
+    ).ravel()
     light = np.zeros((rows, width), dtype=np.float32)
-    for offset in ((-0.25, -0.25), (0.25, -0.25), (-0.25, 0.25), (0.25, 0.25)):
-        d, t = rays(offset), middle.copy()
+    for dx, dy in ((-0.25, -0.25), (0.25, -0.25), (-0.25, 0.25), (0.25, 0.25)):
+        d, t = _rays(scene, index, (dx, dy)), start.copy()
         _nearby_meeting(tall, long, centre, d, t)
-        at = (centre + t[:, None] * d)[:, :2] / render.TEXEL_M + len(skin) / 2
+        at = (centre + t[:, None] * d)[:, :2] / texel_m + np.array(skin.shape[1::-1]) / 2
         at = at.astype(np.float32).reshape(rows, width, 2)
         light += cv2.remap(skin, at[..., 0], at[..., 1], cv2.INTER_LINEAR, borderValue=0.45)
     light = cv2.GaussianBlur(light / 4, (0, 0), render.BLUR_PX)
     return np.asarray(255 * light * (0.85 + 0.04 * (index % 4)))
+
+
+def _rays(scene: TexturedScene, index: int, offset: tuple[float, float], step: int = 1) -> FloatArray:
+    """Return rays through every `step`-th pixel of a photograph, an offset from its centre, (k, 3)."""
+    x, y = np.meshgrid(*(np.arange(size // step) * step for size in scene.camera.size_px))
+    uv = tangents_from_pixel(scene.camera, np.column_stack([x.ravel(), y.ravel()]).astype(float) + offset)
+    return np.ascontiguousarray(np.column_stack([uv, -np.ones(len(uv))]) @ scene.rotation[index].T)
 
 
 def surface_at(scene: TexturedScene, index: int, xy: FloatArray) -> FloatArray:
@@ -171,21 +215,39 @@ def surface_at(scene: TexturedScene, index: int, xy: FloatArray) -> FloatArray:
     return np.asarray(centre + length[:, None] * d)
 
 
-def render_scene(folder: Path, roughness: str, photographs: int, finer: int = 1) -> TexturedScene:
+def overlapping(scene: TexturedScene) -> IntArray:
+    """Return the pairs of photographs that look at points less than OVERLAP_M apart, (k, 2)."""
+    outward = scene.rotation[:, :, 2]
+    seen = scene.position - outward * (scene.position[:, 2] / outward[:, 2])[:, None]
+    return cKDTree(seen[:, :2]).query_pairs(OVERLAP_M, output_type="ndarray")
+
+
+def render_scene(
+    folder: Path, roughness: str, photographs: int, finer: float = 1.0, layout: str = "dome"
+) -> TexturedScene:
     """Write the photographs and a survey file; return the scene."""
     folder.mkdir(parents=True, exist_ok=True)
-    scene, skin = textured_scene(roughness, photographs, finer), render.texture()
+    scene = textured_scene(roughness, photographs, finer, layout)
+    skin, texel = scene_texture(scene, finer)
     for index in range(photographs):
         noise = np.random.default_rng((render.SEED, index)).normal(
             0, render.NOISE, scene.camera.size_px[::-1]
         )
-        picture = np.rint(np.clip(intensities(scene, index, skin) + noise, 0, 255)).astype(np.uint8)
-        cv2.imwrite(str(folder / f"surface_{index + 1:03d}.png"), picture)
+        light = intensities(scene, index, skin, texel)
+        picture = np.rint(np.clip(light + noise, 0, 255)).astype(np.uint8)
+        cv2.imwrite(str(folder / photograph_name(index)), picture)
     (folder / "survey.toml").write_text(
         SURVEY.format(name=folder.name, pixel=PIXEL_MM / finer), encoding="utf-8"
     )
     return scene
 
 
+def photograph_name(index: int) -> str:
+    """Return the file name of a photograph of a scene."""
+    return f"surface_{index + 1:03d}.png"
+
+
 if __name__ == "__main__":
-    render_scene(Path(sys.argv[3]), sys.argv[1], int(sys.argv[2]))
+    of_roughness, number, into, *layout_and_finer = sys.argv[1:]
+    its_layout, finer_by = [*layout_and_finer, *("dome", "1")[len(layout_and_finer) :]]
+    render_scene(Path(into), of_roughness, int(number), float(finer_by), its_layout)

@@ -13,6 +13,7 @@ Schoenberger (2024), Global Structure-from-Motion revisited, ECCV; the pipelines
 from __future__ import annotations
 
 import time
+from collections.abc import Iterable
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -47,7 +48,12 @@ class MapperBaseline:
 
 
 def map_photographs(
-    folder: Path, cameras: tuple[tuple[str, ...], ...], *, at_once: bool = False, threads: int = -1
+    folder: Path,
+    cameras: tuple[tuple[str, ...], ...],
+    *,
+    at_once: bool = False,
+    pairs: Iterable[tuple[str, str]] | None = None,
+    threads: int = -1,
 ) -> MapperBaseline:
     """Run COLMAP's pipeline on photographs and return its largest model.
 
@@ -55,6 +61,7 @@ def map_photographs(
         folder: folder of the photographs.
         cameras: for each camera the names of its photographs, relative to the folder.
         at_once: whether all photographs are oriented together, by the global mapper, instead of one by one.
+        pairs: names of the photographs that are compared; all with each other if not given.
         threads: threads of COLMAP; -1 uses all cores.
 
     Raises:
@@ -83,7 +90,14 @@ def map_photographs(
                     reader_options=reader,
                     extraction_options=extraction,
                 )
-            pycolmap.match_exhaustive(database, matching_options=matching)
+            if pairs is None:
+                pycolmap.match_exhaustive(database, matching_options=matching)
+            else:
+                listed = pycolmap.ImportedPairingOptions()
+                listed.match_list_path = work / "pairs.txt"
+                text = "".join(f"{first} {second}\n" for first, second in pairs)
+                listed.match_list_path.write_text(text, encoding="utf-8")
+                pycolmap.match_image_pairs(database, matching_options=matching, pairing_options=listed)
             models = mapping(database, folder, work, pipeline)
             if not models:
                 raise BackendError("COLMAP's mapper found no model: too few matches between the photographs")

@@ -76,15 +76,17 @@ def surface_points(position: FloatArray, directions: FloatArray) -> FloatArray:
     return np.asarray(position + t[:, None] * directions)
 
 
-def texture(seed: int = SEED) -> AnyArray:
-    """Return the reflectance over the square, a mixture of fine and coarse grain, float32."""
+def texture(
+    seed: int = SEED, size_m: tuple[float, float] = (TEXTURE_M, TEXTURE_M), texel_m: float = TEXEL_M
+) -> AnyArray:
+    """Return the reflectance over a rectangle, a mixture of fine and coarse grain, float32."""
     rng = np.random.default_rng(seed)
-    side = round(TEXTURE_M / TEXEL_M)
-    total = np.zeros((side, side), dtype=np.float32)
+    wide, high = (round(side / texel_m) for side in size_m)
+    total = np.zeros((high, wide), dtype=np.float32)
     for octave in range(OCTAVES):
-        cells = side // (4 * 2**octave) + 3
-        grid = rng.standard_normal((cells, cells)).astype(np.float32)
-        total += cv2.resize(grid, (side, side), interpolation=cv2.INTER_CUBIC) * 1.25**octave
+        cells = (high // (4 * 2**octave) + 3, wide // (4 * 2**octave) + 3)
+        grid = rng.standard_normal(cells).astype(np.float32)
+        total += cv2.resize(grid, (wide, high), interpolation=cv2.INTER_CUBIC) * 1.25**octave
     total = (total - total.mean()) / total.std()
     return np.asarray(np.clip(0.45 + 0.17 * total, 0.02, 0.98), dtype=np.float32)
 

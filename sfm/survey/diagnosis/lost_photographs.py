@@ -70,6 +70,7 @@ TRIMMINGS = 3  # rotations without the half of the pairs of rays that fits worst
 # hundredths.
 MAX_RADIAL = 0.2
 STEP = 0.02  # first step of the radial distortion
+PAIRS_FIRST = 20  # about so many pairs are tried first: if these have a base, the others are not needed
 EVALUATIONS = 80  # of the parallax, by the simplex method of Nelder and Mead
 C_FACTORS = (1.4, 0.7, 2.0, 0.5)  # of the given principal distance: a crop factor, an extender, a zoom
 # RMS residual, in standard deviations of image points, from which another minimum is searched. It saves the
@@ -360,10 +361,11 @@ def refuse_no_base(network: Network, cameras: tuple[Camera, ...]) -> None:
     if parallax.max() < needed:  # no rotation either, whatever the camera
         turns = "; if the object turns before a background that stands still, mask the background"
     else:
-        least = _least_parallax(network, cameras, pairs)
-        if least is None or not least.max() < needed:
-            return
-        parallax = least
+        for tried in (pairs[:: 1 + len(pairs) // PAIRS_FIRST], pairs):
+            least = _least_parallax(network, cameras, tried)
+            if least is None or not least.max() < needed:
+                return
+            parallax = least
     raise GeometryError(
         f"orientation: no base: the {len(network.images)} photographs were taken from one position; "
         f"rotations alone fit {MAX_DISTANT_FRACTION:.0%} of their points to {np.median(parallax):.2g} px, "
@@ -398,14 +400,18 @@ def _least_parallax(
     """Return the parallax of each pair, px, minimised over c and distortion; None at the search limit."""
     from scipy.optimize import minimize  # importing takes half a second, and most surveys never need it
 
-    seen = network.image_points
+    rows, place = np.unique(np.concatenate([row for pair in pairs for row in pair]), return_inverse=True)
+    seen = network.image_points.select(rows)
+    ends = np.cumsum([len(a) for pair in pairs for a in pair])
+    places = np.split(place, ends[:-1])
     given = image_tangents(seen, network.camera, cameras)
     c_px = np.array([camera.c_px for camera in cameras])[network.camera[seen.image]]
 
     def parallax(x: FloatArray) -> FloatArray:
         uv = given / np.exp(x[0])
         rays = rays_of(uv * (1 + x[1] * (uv**2).sum(axis=1, keepdims=True)))
-        return np.array([c_px[a[0]] * np.exp(x[0]) * _parallax(rays[a], rays[b]) for a, b in pairs])
+        each = zip(places[::2], places[1::2], strict=True)
+        return np.array([c_px[a[0]] * np.exp(x[0]) * _parallax(rays[a], rays[b]) for a, b in each])
 
     def cost(x: FloatArray) -> float:
         if not (SCALES[0] <= np.exp(x[0]) <= SCALES[-1] and abs(x[1]) <= MAX_RADIAL):

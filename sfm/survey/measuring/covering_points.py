@@ -18,7 +18,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from sfm.matching.correlation import MIN_CORRELATION
-from sfm.matching.lsm.coverage import CoveredPixels, plane_warps, project_points
+from sfm.matching.lsm.coverage import CoveredPixels, photographs_towards, plane_warps, project_points
 from sfm.matching.lsm.patch_equations import linear_part
 from sfm.matching.lsm.surface_planes import NEIGHBOURS, Planes, planes_at, tilted_planes
 from sfm.matching.lsm.two_photo import COARSE_STEP, LsmMatches, LsmSettings, match_lsm
@@ -206,8 +206,8 @@ def seen_squares(
 ) -> Iterator[tuple[int, IntArray, FloatArray]]:
     """Yield each oriented photograph that sees squares from their front, which these are, and where, px."""
     k, points = len(squares), squares.planes.points
-    oriented = np.flatnonzero(estimate.oriented)
-    for images in np.array_split(oriented, 1 + len(oriented) * k // SQUARES_AT_ONCE) if k else ():
+    near = photographs_towards(estimate, camera, points)
+    for images in np.array_split(near, 1 + len(near) * k // SQUARES_AT_ONCE) if len(near) else ():
         image = np.repeat(images, k)
         at = project_points(estimate, camera, image, np.tile(points, (len(images), 1)))
         at = at.reshape(len(images), k, 2)
