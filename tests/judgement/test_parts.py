@@ -10,8 +10,9 @@ import pytest
 import sfm
 from sfm.adjustment.result import Adjustment
 from sfm.judgement.hypotheses import hypotheses
-from sfm.judgement.hypotheses.hypotheses import judge_alternatives
-from sfm.judgement.hypotheses.parts import of_all_parts, parts_of
+from sfm.judgement.hypotheses.hypotheses import contradicted_parameters, find_causes, judge_alternatives
+from sfm.judgement.hypotheses.parts import held_parameters, of_all_parts, parts_of
+from sfm.judgement.hypotheses.score import reduce_adjustment
 from sfm.model.camera import project
 from sfm.model.estimate import Estimate
 from sfm.model.network import ImagePoints, Network
@@ -112,6 +113,53 @@ def test_a_wrong_lens_is_one_remark_of_all_parts() -> None:
     start = replace(truth, cameras=(camera.with_parameters(values),))
     (said,) = judge_alternatives(free_adjustment(network, start)).causes
     assert said.kind == "held_parameter" and "K1" in said.names("parameters")
+
+
+def slightly_wrong_lens(share: float) -> Adjustment:
+    """Photographs of 48 stations whose K1 is held at a value that is wrong by so much."""
+    network, truth = make_network(
+        seed_of("shared 0"), images=48, points=60, visibility=0.5, free=("c", "x0", "y0")
+    )
+    (camera,) = truth.cameras
+    values = camera.parameters * np.where(np.array(camera.names) == "K1", 1 - share, 1.0)
+    return free_adjustment(network, replace(truth, cameras=(camera.with_parameters(values),)))
+
+
+@pytest.mark.usefixtures("in_parts")
+def test_evidence_of_the_parts_together_is_that_of_the_network_but_for_its_links() -> None:
+    a = slightly_wrong_lens(0.1)
+    solved = hypotheses._free_parts(a, parts_of(a.network, ~a.rejected, 12))
+    parts = [reduce_adjustment(part) for part in solved if part is not None]
+    k1, whole, each = (
+        next(
+            x
+            for x in held_parameters(some)
+            if x.parameters == ((0, a.estimate.cameras[0].names.index("K1")),)
+        )
+        for some in (parts, [reduce_adjustment(a)], parts[:1])
+    )
+    assert len(parts) == 4 and 2 * each.gain.value < k1.gain.value < whole.gain.value
+    # points that two parts show are estimated in both, and each part has a datum of its own
+    assert k1.gain.value > 0.6 * whole.gain.value
+    information = k1.gain.value / k1.gain.beta[0] ** 2
+    assert abs(k1.gain.beta[0] - whole.gain.beta[0]) < 2 * information**-0.5
+    assert k1.redundancy == sum(part.redundancy for part in parts)
+
+
+@pytest.mark.usefixtures("in_parts")
+def test_a_lens_that_no_part_names_alone_is_named_by_all_together() -> None:
+    a = slightly_wrong_lens(0.08)
+    for part in hypotheses._free_parts(a, parts_of(a.network, ~a.rejected, 12)):
+        assert part is not None and not find_causes(part)
+    (said,) = judge_alternatives(a).causes
+    assert said.kind == "held_parameter" and said.names("parameters")[0] in ("K1", "K2")
+    assert said.number("shift") > 1
+
+
+@pytest.mark.usefixtures("in_parts")
+def test_parameters_that_a_large_network_demands_are_found_in_its_parts() -> None:
+    assert contradicted_parameters(slightly_wrong_lens(0.1))[0] == ("camera 1", "K1")
+    assert contradicted_parameters(slightly_wrong_lens(0.0)) == ()
 
 
 @pytest.mark.usefixtures("in_parts")

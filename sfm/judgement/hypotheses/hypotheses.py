@@ -11,7 +11,8 @@ Source: Foerstner and Wrobel (2016), Photogrammetric Computer Vision, sec. 4.6.4
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Iterator, Sequence
+from contextlib import suppress
 from dataclasses import dataclass, replace
 from operator import attrgetter
 from typing import Literal, NamedTuple
@@ -31,7 +32,7 @@ from sfm.judgement.hypotheses.alternatives import (
 )
 from sfm.judgement.hypotheses.columns import columns_of
 from sfm.judgement.hypotheses.families import HELD, MOVED, Alternative, InteriorFamily, PointFamily
-from sfm.judgement.hypotheses.parts import of_all_parts, parts_of, reduced_to
+from sfm.judgement.hypotheses.parts import held_parameters, of_all_parts, parts_of, reduced_to
 from sfm.judgement.hypotheses.refit import (
     Refit,
     log_likelihood_of,
@@ -44,6 +45,7 @@ from sfm.judgement.hypotheses.refit import (
 )
 from sfm.judgement.hypotheses.score import (
     Gain,
+    Reduced,
     log_likelihood_gain,
     reduce_adjustment,
     squares_gained,
@@ -149,34 +151,72 @@ def judge_alternatives(final: Adjustment, *, unit: str = "") -> JudgedAssumption
 
 
 def _judge_parts(final: Adjustment, unit: str) -> JudgedAssumptions:
-    """Return the evidence of the image points of each part of a large network alone."""
-    network, used = final.network, ~final.rejected
-    parts = parts_of(network, used, PART_PHOTOGRAPHS)
-    causes, tested = [], np.zeros(len(network.images), dtype=bool)
-    reduced = reduced_to(network, final.estimate, used, parts)
-    for images, (part, start, rows) in zip(parts, reported("parts tested", reduced, len(parts)), strict=True):
-        factor, alarm = final.image_sigma_factor[rows], final.false_alarm / len(parts)
-        plain = adjust_image_points(
-            part, start, final.rejected[rows], factor, false_alarm=alarm, most=PART_IMAGE_POINTS
-        )
+    """Return the evidence of the image points of each part of a large network, and of all parts together."""
+    network = final.network
+    parts = parts_of(network, ~final.rejected, PART_PHOTOGRAPHS)
+    causes, said, tested = list[Cause](), list[Remark](), np.zeros(len(network.images), dtype=bool)
+    solved: list[tuple[Adjustment, Reduced]] = []
+    for images, plain in zip(parts, _free_parts(final, parts), strict=True):
         if plain is None:
             continue
-        if final.error_correlation is not None:
-            plain = with_error_correlation(plain, final.error_correlation)
         try:
-            accepted = find_causes(plain)
+            accepted, reduced = find_causes(plain), reduce_adjustment(plain)
         except np.linalg.LinAlgError:
             continue
         tested |= images
-        causes += [remark_of(plain, cause, unit, WITHOUT) for cause in accepted]
-    joined, unchecked = of_all_parts(causes), []
+        solved.append((plain, reduced))
+        causes += accepted
+        said += [remark_of(plain, cause, unit, WITHOUT) for cause in accepted]
+    said += _shared_by_parts(solved, causes, unit)
+    joined, unchecked = of_all_parts(said), []
     names = [[network.images[i] for i in np.flatnonzero(tested == which)] for which in (False, True)]
     if tested.any():
         size = {"parts": len(parts), "most": max(int(part.sum()) for part in parts)}
-        unchecked.append(remark("assumptions_tested", photographs=names[True], causes=len(causes), **size))
+        unchecked.append(remark("assumptions_tested", photographs=names[True], causes=len(said), **size))
     if not tested.all():
         unchecked.append(remark("photographs_untested", photographs=names[False], most=PART_PHOTOGRAPHS))
     return JudgedAssumptions(joined, tuple(unchecked))
+
+
+def _free_parts(final: Adjustment, parts: Sequence[BoolArray]) -> Iterator[Adjustment | None]:
+    """Yield the adjustment of the image points of each part alone; None where they determine no solution."""
+    reduced = reduced_to(final.network, final.estimate, ~final.rejected, parts)
+    alarm = final.false_alarm / (len(parts) + 1)  # of each part, and of all together
+    for part, start, rows in reported("parts tested", reduced, len(parts)):
+        factor = final.image_sigma_factor[rows]
+        plain = adjust_image_points(
+            part, start, final.rejected[rows], factor, false_alarm=alarm, most=PART_IMAGE_POINTS
+        )
+        if plain is not None and final.error_correlation is not None:
+            plain = with_error_correlation(plain, final.error_correlation)
+        yield plain
+
+
+def _shared_by_parts(
+    solved: Sequence[tuple[Adjustment, Reduced]], causes: Sequence[Cause], unit: str
+) -> list[Remark]:
+    """Return the remark on the held parameter that all parts together demand, if none of them names one.
+
+    It shifts the part most that gains most by it.
+    """
+    if not solved or any(isinstance(cause.alternative.family, InteriorFamily) for cause in causes):
+        return []
+    every, level = held_parameters([reduced for _, reduced in solved]), solved[0][0].levels.family
+    shared = max(every, key=attrgetter("evidence"), default=None)
+    if shared is None or not (is_significant(shared, len(every), level) and shared.evidence > -np.log(level)):
+        return []
+    own = [
+        (interior, plain)
+        for plain, reduced in solved
+        for interior in interiors(reduced, HELD)
+        if interior.parameters == shared.parameters
+    ]
+    clearest, plain = max(own, key=lambda of_part: of_part[0].gain.value)
+    refitted = refit(plain, clearest, plain, least=-np.inf)
+    if refitted is None:
+        return []
+    cause = Cause(shared, replace(refitted, beta=shared.gain.beta), ())
+    return [remark_of(plain, cause, unit, WITHOUT)]
 
 
 def _judge_free(plain: Adjustment | None, unit: str, without: str | None) -> JudgedAssumptions:
@@ -462,23 +502,26 @@ def _with_joint_shifts(plain: Adjustment, causes: tuple[Cause, ...]) -> tuple[Ca
 def contradicted_parameters(a: Adjustment) -> tuple[tuple[str, str], ...]:
     """Return (camera or group, parameter) of held parameters that image points contradict, clearest first.
 
-    Each improves the fit of the finished adjustment beyond chance when it alone is freed.
+    Each improves the fit of the finished adjustment beyond chance when it alone is freed. Of a large network,
+    the evidence of its parts is added.
     """
-    plain = free_network(a) if len(a.network.images) <= MAX_PHOTOGRAPHS else None
-    if plain is None:
-        return ()
-    try:
-        reduced = reduce_adjustment(plain)
-    except np.linalg.LinAlgError:
-        return ()
-    single = [interior for interior in interiors(reduced, HELD) if len(interior.gain.beta) == 1]
-    every, level = [interior.priced(reduced) for interior in single], plain.levels.family
+    if len(a.network.images) <= MAX_PHOTOGRAPHS:
+        solved: Iterable[Adjustment | None] = [free_network(a)]
+    else:
+        solved = _free_parts(a, parts_of(a.network, ~a.rejected, PART_PHOTOGRAPHS))
+    plain, reduced = a, list[Reduced]()
+    for part in solved:
+        with suppress(np.linalg.LinAlgError):
+            if part is not None:
+                reduced.append(reduce_adjustment(part))
+                plain = part
+    every, level = held_parameters(reduced), plain.levels.family
     significant = [interior for interior in every if is_significant(interior, len(every), level)]
     contradicted = sorted(significant, key=lambda interior: -interior.gain.value)
     names = []
     for interior in contradicted:
         index, s = interior.parameters[0]
-        camera = plain.estimate.cameras[index]
+        camera = a.estimate.cameras[index]
         names.append((camera.owner_of(s), camera.names[s]))
     return tuple(names)
 

@@ -2,9 +2,11 @@
 
 The tests need dense normal equations, whose time grows with the cube of the photographs. A network is halved
 where fewest photographs have points in common, and so are its halves. The level of a question is divided by
-the number of parts. A cause that all parts share has less evidence in each.
+the number of parts. What the cameras of all parts share has less evidence in each. The steps of one interior
+parameter are therefore combined, with the information of each part as its weight.
 
-Source: George (1973), SIAM J. Numer. Anal. 10(2) (dissection); Bonferroni's inequality.
+Source: George (1973), SIAM J. Numer. Anal. 10(2) (dissection); Bonferroni's inequality; Koch (1999),
+Parameter Estimation and Hypothesis Testing in Linear Models, sec. 3.2 (normal equations of groups add up).
 """
 
 from __future__ import annotations
@@ -17,8 +19,12 @@ from scipy.sparse import csr_matrix
 from scipy.sparse.csgraph import connected_components
 
 from sfm.adjustment.engine.solvers.fronts import halve
+from sfm.judgement.hypotheses.alternatives import interiors
+from sfm.judgement.hypotheses.families import HELD, Alternative
+from sfm.judgement.hypotheses.score import Gain, Reduced
 from sfm.model.conventions import BoolArray
 from sfm.model.estimate import Estimate
+from sfm.model.likelihood import price_of
 from sfm.model.network import ImagePoints, Network
 from sfm.model.reduced_network import reduce_network
 from sfm.model.remarks.remark import Remark, together
@@ -83,6 +89,49 @@ def reduced_to(
             for k, camera in enumerate(start.cameras)
         )
         yield part, replace(start, cameras=cameras), rows
+
+
+def held_parameters(parts: Sequence[Reduced]) -> list[Alternative]:
+    """Return an alternative for each held interior parameter, with the evidence of all parts together.
+
+    Its photographs are those of the parts, one after another.
+
+    Args:
+        parts: networks that have only cameras in common.
+    """
+    of_parameter: dict[tuple[tuple[int, int], ...], list[tuple[Alternative, Reduced]]] = {}
+    for part in parts:
+        for interior in interiors(part, HELD):
+            if len(interior.gain.beta) == 1:
+                of_parameter.setdefault(interior.parameters, []).append((interior.priced(part), part))
+    return [_together(of_parts) for of_parts in of_parameter.values()]
+
+
+def _together(of_parts: Sequence[tuple[Alternative, Reduced]]) -> Alternative:
+    """Return the alternative of one parameter with the evidence of several parts."""
+    every = [alternative for alternative, _ in of_parts]
+    step = np.array([alternative.gain.beta[0] for alternative in every])
+    information = np.array([alternative.gain.value for alternative in every]) / step**2
+    total = float(information.sum())
+    mean = float(information @ step) / total
+    spread = every[0].spread
+    spread = replace(
+        spread,
+        factor=float(information @ [alternative.spread.factor for alternative in every]) / total,
+        redundancy=sum(alternative.spread.redundancy for alternative in every),
+    )
+    joint = replace(
+        every[0],
+        factor=np.concatenate([alternative.factor for alternative in every]),
+        gain=Gain(total * mean**2, 1, np.array([mean])),
+        spread=spread,
+        price=price_of(1, sum(len(part.image) for _, part in of_parts), every[0].search),
+        redundancy=sum(alternative.redundancy for alternative in every),
+    )
+    if not joint.evidence_beside_spread > 0:
+        return joint  # not significant in any case
+    effects = [part.design_effect(alternative.whitened(part)) for alternative, part in of_parts]
+    return replace(joint, design_effect=float(information @ effects) / total)
 
 
 def of_all_parts(said: Sequence[Remark]) -> tuple[Remark, ...]:
