@@ -86,7 +86,7 @@ def run_survey_file(survey_file: Path, options: RunOptions) -> Path:
             refuse_other_origin,
             write_result,
         )
-        from sfm.runtime.forecast import Run, RunHistory, announced, expected_seconds
+        from sfm.runtime.forecast import Run, RunHistory, forecast
         from sfm.runtime.memory import peak_bytes
         from sfm.runtime.progress_bar import drawn_progress
         from sfm.runtime.threads import cores, one_blas_thread
@@ -155,10 +155,10 @@ def run_survey_file(survey_file: Path, options: RunOptions) -> Path:
         SurveyLog(watch=drawn) as log,
     ):
         history, work = RunHistory.of_user(), work_of(survey, files)
-        runs = history.read()
-        if options.cluster is None and (sentence := announced(work, runs)):
+        expected = forecast(work, history.read())
+        if options.cluster is None and (sentence := expected.announced()):
             print(sentence, file=sys.stderr)
-        drawn.countdown.expected = expected_seconds(work, runs)
+        drawn.countdown.expected = expected.seconds
         log.start(survey.name, survey_file, **origin.written(folder))
         with reporting_unfinished(folder, log, jobs=workers, pdf=options.pdf):
             result = run_survey(

@@ -19,7 +19,7 @@ from sfm.model.errors import BackendError, SurveyFileError
 from sfm.model.remarks.remark import Remark, remark
 from sfm.model.solution import Solution, solution_of
 from sfm.pipeline import run_survey as run_stages
-from sfm.runtime.forecast import RunHistory, expected_seconds
+from sfm.runtime.forecast import RunHistory, forecast
 from sfm.runtime.progress import SILENT, Progress
 from sfm.runtime.threads import cores, one_blas_thread
 from sfm.survey.assembly import OtherPrograms
@@ -79,9 +79,8 @@ def run_survey(
             watching = drawn = stack.enter_context(drawn_progress())
             reads = reads_photographs(survey)
             files = find_photographs(survey, images_dir=images_dir) if reads else NO_PHOTOGRAPHS
-            expected = expected_seconds(work_of(survey, files), RunHistory.of_user().read())
-            expected.pop("report", None)
-            drawn.countdown.expected = expected
+            expected = forecast(work_of(survey, files), RunHistory.of_user().read(), without=("report",))
+            drawn.countdown.expected = expected.seconds
         elif progress is not False:
             watching = progress
         return run_stages(

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import json
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Container, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import asdict, dataclass, field
 from pathlib import Path
@@ -134,55 +134,51 @@ TYPICAL = (
 )
 
 
-def expected_seconds(work: Work, runs: Sequence[Run]) -> dict[str, float]:
-    """Return the expected time of each stage of a survey, in their order, s; empty where none was alike.
+@dataclass(frozen=True)
+class Forecast:
+    """Time and memory that a survey is expected to take."""
+
+    seconds: dict[str, float]  # of each stage, in their order, s; empty where no run was alike
+    memory_mb: float = 0.0  # its peak, 10^6 bytes; 0 where no run was alike
+    of_size: bool = False  # whether a run of about this size took that memory
+
+    def announced(self) -> str:
+        """Return one sentence on the time and memory of a long survey; empty for others.
+
+        Raises:
+            KolinearError: a run of about this size took much more memory than there is.
+        """
+        there = within_bytes() / 1e6
+        needs = f"{self.memory_mb / 1000:.1f} GB of memory"
+        if self.memory_mb > MEMORY_MARGIN * there and self.of_size:
+            raise KolinearError(
+                f"the survey needs about {needs}, and {there / 1000:.1f} GB are there for it: end other "
+                "programs, use a larger computer or --cluster, or take fewer photographs or smaller ones"
+            )
+        whole, short = sum(self.seconds.values()), self.memory_mb > there
+        if whole < LONG_SECONDS and not short:
+            return ""
+        parts = ", ".join(f"{stage} {duration(took)}" for stage, took in self.seconds.items() if took >= 1)
+        said = [f"{duration(whole)} ({parts})", *([needs] if self.memory_mb else [])]
+        lacking = f", of which {there / 1000:.1f} GB are there" if short else ""
+        return f"expected: {' and '.join(said)}{lacking}"
+
+
+def forecast(work: Work, runs: Sequence[Run], *, without: Container[str] = ()) -> Forecast:
+    """Return the expected time and memory of a survey.
 
     Args:
         work: of the survey.
         runs: earlier runs of the user, the last one last.
+        without: stages that it does not have.
     """
-    nearest = _nearest(work, runs)
-    return {} if nearest is None else nearest.scaled_to(work)
-
-
-def expected_memory_mb(work: Work, runs: Sequence[Run]) -> float:
-    """Return the expected peak of the memory of a survey, 10^6 bytes; 0 where none was alike.
-
-    Args:
-        work: of the survey.
-        runs: earlier runs of the user, the last one last.
-    """
-    nearest = _nearest(work, [run for run in runs if run.memory_mb > 0])
-    return 0.0 if nearest is None else nearest.memory_scaled_to(work)
-
-
-def announced(work: Work, runs: Sequence[Run]) -> str:
-    """Return one sentence on the time and memory of a long survey; empty for others.
-
-    Args:
-        work: of the survey.
-        runs: earlier runs of the user, the last one last.
-
-    Raises:
-        KolinearError: a run of about this size took much more memory than there is.
-    """
-    memory, there = expected_memory_mb(work, runs), within_bytes() / 1e6
-    nearest = _nearest(work, [run for run in runs if run.memory_mb > 0])
-    alike = nearest is not None and nearest.work.distance(work) < OTHERS_APART
-    needs = f"{memory / 1000:.1f} GB of memory"
-    if memory > MEMORY_MARGIN * there and alike:
-        raise KolinearError(
-            f"the survey needs about {needs}, and {there / 1000:.1f} GB are there for it: end other "
-            "programs, use a larger computer or --cluster, or take fewer photographs or smaller ones"
-        )
-    seconds = expected_seconds(work, runs)
-    whole, short = sum(seconds.values()), memory > there
-    if whole < LONG_SECONDS and not short:
-        return ""
-    parts = ", ".join(f"{stage} {duration(of_stage)}" for stage, of_stage in seconds.items() if of_stage >= 1)
-    said = [f"{duration(whole)} ({parts})", *([needs] if memory else [])]
-    lacking = f", of which {there / 1000:.1f} GB are there" if short else ""
-    return f"expected: {' and '.join(said)}{lacking}"
+    nearest, measured = _nearest(work, runs), _nearest(work, [run for run in runs if run.memory_mb > 0])
+    if nearest is None:
+        return Forecast({})
+    seconds = {stage: took for stage, took in nearest.scaled_to(work).items() if stage not in without}
+    if measured is None:
+        return Forecast(seconds)
+    return Forecast(seconds, measured.memory_scaled_to(work), measured.work.distance(work) < OTHERS_APART)
 
 
 def duration(seconds: float) -> str:
@@ -372,7 +368,7 @@ class BatchCountdown:
         work = self._works.get(name)
         if work is None:
             return {}
-        seconds = expected_seconds(work, self._runs)
+        seconds = forecast(work, self._runs).seconds
         return {stage: s * (self._threads if stage in MEASURED else 1) for stage, s in seconds.items()}
 
     def _surveyed(self, name: str) -> _Surveyed:

@@ -11,7 +11,6 @@ import pytest
 from rich.console import Console
 
 from sfm.model.errors import KolinearError
-from sfm.runtime import forecast
 from sfm.runtime.forecast import (
     KEPT_RUNS,
     PROGRAM_MB,
@@ -21,9 +20,7 @@ from sfm.runtime.forecast import (
     Run,
     RunHistory,
     Work,
-    announced,
-    expected_memory_mb,
-    expected_seconds,
+    forecast,
     slowness,
 )
 from sfm.runtime.progress_bar import drawn_progress
@@ -37,20 +34,21 @@ LARGE = Run(Work(("targets",), 100, 1.0), {"targets": 40.0, "orientation": 30.0,
 
 def test_the_nearest_run_of_the_same_sources_is_scaled() -> None:
     work = Work(("targets",), 20, 2.0)
-    expected = expected_seconds(work, [LARGE, SMALL])
+    expected = forecast(work, [LARGE, SMALL]).seconds
     assert expected == pytest.approx({"targets": 20.0, "orientation": 2.0, "adjustment": 2 * 2**1.2})
-    assert expected_seconds(Work(("targets",), 80, 1.0), [LARGE, SMALL])["targets"] == pytest.approx(32.0)
-    assert expected_seconds(SMALL.work, [SMALL]) == SMALL.seconds
+    assert forecast(Work(("targets",), 80, 1.0), [LARGE, SMALL]).seconds["targets"] == pytest.approx(32.0)
+    assert forecast(SMALL.work, [SMALL]).seconds == SMALL.seconds
+    assert "adjustment" not in forecast(SMALL.work, [SMALL], without=("adjustment",)).seconds
     again = Run(SMALL.work, {"targets": 7.0})
-    assert expected_seconds(SMALL.work, [SMALL, again]) == again.seconds  # of equals the last
+    assert forecast(SMALL.work, [SMALL, again]).seconds == again.seconds  # of equals the last
 
 
 def test_without_a_run_of_ones_own_a_typical_one_of_its_sources_stands_in() -> None:
     for run in TYPICAL:
-        assert expected_seconds(run.work, []) == pytest.approx(run.seconds)
+        assert forecast(run.work, []).seconds == pytest.approx(run.seconds)
     elsewhere = Run(Work(("texture",), 11, 6.29), {"tie points": 1.0})
-    assert expected_seconds(SMALL.work, [elsewhere])["targets"] > 0
-    assert expected_seconds(Work(("unheard of",), 3), [SMALL]) == {}
+    assert forecast(SMALL.work, [elsewhere]).seconds["targets"] > 0
+    assert forecast(Work(("unheard of",), 3), [SMALL]).seconds == {}
     assert Work(("given",), 3).distance(Work(("given",), 3, 2.0)) == math.inf  # one of them reads photographs
 
 
@@ -135,7 +133,7 @@ def test_a_folder_that_others_may_write_keeps_nothing(
 def test_surveys_of_given_image_points_are_scaled_by_these() -> None:
     few = Run(Work(("given",), 10, 0.0, 100), {"adjustment": 1.0, "orientation": 2.0})
     many = Run(Work(("given",), 10, 0.0, 100_000), {"adjustment": 1000.0, "orientation": 20.0})
-    expected = expected_seconds(Work(("given",), 40, 0.0, 50_000), [many, few])
+    expected = forecast(Work(("given",), 40, 0.0, 50_000), [many, few]).seconds
     assert expected == pytest.approx({"adjustment": 1000.0 * 0.5**0.6, "orientation": 20.0 * 0.5**0.6})
 
 
@@ -144,34 +142,34 @@ def test_memory_grows_with_the_work_beyond_that_of_the_program() -> None:
     many = Run(Work(("given",), 10, 0.0, 100_000), {"adjustment": 9.0}, PROGRAM_MB + 800.0)
     later = Run(Work(("given",), 10, 0.0, 100_000), {"adjustment": 9.0})  # of an earlier version
     runs = [few, many, later]
-    assert expected_memory_mb(many.work, runs) == many.memory_mb
-    assert expected_memory_mb(Work(("given",), 10, 0.0, 50_000), runs) == pytest.approx(PROGRAM_MB + 400.0)
-    assert expected_memory_mb(Work(("given",), 10, 0.0, 1500), runs) == pytest.approx(PROGRAM_MB + 15.0)
-    assert expected_memory_mb(Work(("unheard of",), 10), runs) == 0.0
+    assert forecast(many.work, runs).memory_mb == many.memory_mb
+    assert forecast(Work(("given",), 10, 0.0, 50_000), runs).memory_mb == pytest.approx(PROGRAM_MB + 400.0)
+    assert forecast(Work(("given",), 10, 0.0, 1500), runs).memory_mb == pytest.approx(PROGRAM_MB + 15.0)
+    assert forecast(Work(("unheard of",), 10), runs).memory_mb == 0.0
     texture = Run(Work(("texture",), 20, 4.0), {"tie points": 1.0}, PROGRAM_MB + 500.0)
-    assert expected_memory_mb(Work(("texture",), 20, 4.0), [texture]) == texture.memory_mb
-    larger = expected_memory_mb(Work(("texture",), 40, 4.0), [texture])
+    assert forecast(Work(("texture",), 20, 4.0), [texture]).memory_mb == texture.memory_mb
+    larger = forecast(Work(("texture",), 40, 4.0), [texture]).memory_mb
     assert texture.memory_mb < larger < PROGRAM_MB + 1000.0
     for run in TYPICAL:
-        assert expected_memory_mb(run.work, []) == pytest.approx(run.memory_mb)
+        assert forecast(run.work, []).memory_mb == pytest.approx(run.memory_mb)
 
 
 def test_a_long_survey_is_announced_and_one_without_room_refused(monkeypatch: pytest.MonkeyPatch) -> None:
-    assert announced(SMALL.work, [SMALL]) == ""
-    assert announced(Work(("unheard of",), 10), [SMALL]) == ""
+    assert forecast(SMALL.work, [SMALL]).announced() == ""
+    assert forecast(Work(("unheard of",), 10), [SMALL]).announced() == ""
     long = Run(Work(("targets",), 500, 1.0), {"targets": 0.4, "adjustment": 7000.0, "report": 130.0}, 6600.0)
     expected = "expected: 2.0 h (adjustment 1.9 h, report 2 min) and 6.6 GB of memory"
-    monkeypatch.setattr(forecast, "within_bytes", lambda: 7e9)
-    assert announced(long.work, [long]) == expected
+    monkeypatch.setattr("sfm.runtime.forecast.within_bytes", lambda: 7e9)
+    assert forecast(long.work, [long]).announced() == expected
     unknown = Run(Work(("other",), 500), long.seconds)  # of an earlier version
-    assert announced(unknown.work, [unknown]) == "expected: 2.0 h (adjustment 1.9 h, report 2 min)"
-    monkeypatch.setattr(forecast, "within_bytes", lambda: 6e9)
-    assert announced(long.work, [long]) == f"{expected}, of which 6.0 GB are there"
-    monkeypatch.setattr(forecast, "within_bytes", lambda: 5e9)
+    assert forecast(unknown.work, [unknown]).announced() == "expected: 2.0 h (adjustment 1.9 h, report 2 min)"
+    monkeypatch.setattr("sfm.runtime.forecast.within_bytes", lambda: 6e9)
+    assert forecast(long.work, [long]).announced() == f"{expected}, of which 6.0 GB are there"
+    monkeypatch.setattr("sfm.runtime.forecast.within_bytes", lambda: 5e9)
     with pytest.raises(KolinearError, match=r"needs about 6\.6 GB of memory, and 5\.0 GB are there"):
-        announced(long.work, [long])
+        forecast(long.work, [long]).announced()
     far = Work(("targets",), 20_000, 1.0)  # nothing of this size is known, so that it is only told
-    assert announced(far, [long]).endswith("GB of memory, of which 5.0 GB are there")
+    assert forecast(far, [long]).announced().endswith("GB of memory, of which 5.0 GB are there")
 
 
 def test_a_stage_that_finds_more_to_do_says_nothing_of_the_others() -> None:

@@ -78,7 +78,7 @@ def audit(
             write_result,
         )
         from sfm.report.pages import page_of, texts_of
-        from sfm.runtime.forecast import Run, RunHistory, announced, expected_seconds
+        from sfm.runtime.forecast import Run, RunHistory, forecast
         from sfm.runtime.memory import peak_bytes
         from sfm.runtime.progress_bar import drawn_progress
         from sfm.runtime.threads import cores, one_blas_thread
@@ -108,11 +108,10 @@ def audit(
         SurveyLog(watch=drawn) as log,
     ):
         history, work = RunHistory.of_user(), work_of(audited, NO_PHOTOGRAPHS)
-        runs = history.read()
-        if sentence := announced(work, runs):
+        expected = forecast(work, history.read(), without=("comparison",))
+        if sentence := expected.announced():
             print(sentence, file=sys.stderr)
-        expected = expected_seconds(work, runs)
-        drawn.countdown.expected = {stage: s for stage, s in expected.items() if stage != "comparison"}
+        drawn.countdown.expected = expected.seconds
         log.start(audited.name, model, **origin.written(folder))
         with reporting_unfinished(folder, log, pdf=pdf):
             result = run_survey(audited, jobs=cores(), progress=log)
