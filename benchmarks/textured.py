@@ -88,11 +88,11 @@ def _kolinear(scene: TexturedScene, folder: Path, jobs: int) -> float:
     begun, started = time.process_time(), time.perf_counter()
     result = run_survey(read_survey(folder / "survey.toml"), jobs=jobs)
     seconds, elapsed = time.process_time() - begun, time.perf_counter() - started
+    peak = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1e6  # before the joint covariance
     stages = ", ".join(f"{stage.stage} {stage.seconds:.1f} s" for stage in result.seconds)
     a = result.adjustment
     _print(scene, folder.name, "Kolinear", a.network, a.estimate, seconds, a)
     rejected = f"{int(a.rejected.sum())} of {len(a.rejected)} image points rejected"
-    peak = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1e6
     print(
         f"{'':17}{a.iterations} iterations, {rejected}; {elapsed:.1f} s with {jobs} at a time: {stages}; "
         f"peak memory of the process so far {peak:.2f} GB"
@@ -180,7 +180,7 @@ def joint_distance(errors: FloatArray, covariance: FloatArray) -> float:
     scale = np.sqrt(
         np.diagonal(covariance)
     )  # lengths and angles have the same weight when rank is determined
-    inverse = np.linalg.pinv(covariance / np.outer(scale, scale), rcond=1e-10)
+    inverse = np.linalg.pinv(covariance / np.outer(scale, scale), rcond=1e-10, hermitian=True)
     z = errors.ravel() / scale
     return float(z @ inverse @ z) / (errors.size - 7)
 
