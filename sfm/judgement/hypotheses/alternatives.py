@@ -16,6 +16,7 @@ from __future__ import annotations
 from collections.abc import Iterator
 from dataclasses import dataclass, replace
 from functools import cached_property
+from typing import NamedTuple
 
 import numpy as np
 from scipy.special import gammaln
@@ -41,18 +42,17 @@ from sfm.judgement.hypotheses.score import (
     Gain,
     Reduced,
     Spread,
+    add_to_points,
     determined_inverse,
     gain_of,
     gains_of,
     least_share,
     log_probability,
-    points_by_cameras,
 )
 from sfm.model.conventions import BoolArray, FloatArray, IntArray
 from sfm.model.distortion.models import Role
 from sfm.model.distributions import chi2_isf
 from sfm.model.likelihood import price_of
-from sfm.model.network import sum_rows
 
 MIN_GROUP = 2  # photographs on each side of a split
 MAX_RUNS = 60  # photographs, or runs of photographs, with separate freedoms
@@ -306,7 +306,7 @@ class Part:
     def groups(self) -> FloatArray:
         """Return groups of photographs in no order, grown by two-means, as factors 0 and 1, (p, m)."""
         m = len(self.g)
-        single, _ = gains_of(np.einsum("iaib->iab", self.H), self.g, self.squares)
+        single, _, _ = gains_of(np.einsum("iaib->iab", self.H), self.g, self.squares)
         groups = []
         for first in np.argsort(-single)[:STARTS]:
             factor = (np.arange(m) == first).astype(float)
@@ -330,7 +330,7 @@ class Part:
         left = self.g + np.tensordot(self.H, factor, (2, 0)) @ gain.beta
         others = np.ones(m, dtype=bool) if np.count_nonzero(factor) > 1 else factor == 0
         blocks = np.einsum("iaib->iab", self.H)[others]
-        values, ranks = gains_of(blocks, left[others], self.squares[others])
+        values, ranks, _ = gains_of(blocks, left[others], self.squares[others])
         redundancy = int(ranks.sum()) - gain.rank
         return NONE if redundancy < 1 else Spread(float(values.sum()) / redundancy, redundancy)
 
@@ -409,13 +409,14 @@ def _moves(reduced: Reduced, factor: FloatArray) -> _Moves:
     before, after = (np.bincount(reduced.point[rows], minlength=n) for rows in (~on, on))
     points = np.flatnonzero((before >= MIN_GROUP) & (after >= MIN_GROUP))
     # the columns of a motion are those of the point in the photographs afterwards
-    point, B = reduced.point[on], reduced.B[on]
-    Bt = np.swapaxes(B, 1, 2)
-    V = sum_rows(point, Bt @ B, n)[points]
+    V, g, K = np.zeros((n, 3, 3)), np.zeros((n, 3)), np.zeros((n, 3, len(reduced.t)))
+    add_to_points(
+        *(reduced.B[on], reduced.A[on], reduced.v[on], reduced.image[on], reduced.point[on]),
+        *(reduced.photographs, V, g, K),
+    )
+    V, g, K = V[points], g[points], K[points]
     Ct = np.swapaxes(reduced.L[points] @ V, 1, 2)
-    K = points_by_cameras(Bt @ reduced.A[on], point, reduced.image[on], n, reduced.photographs)[points]
-    K = K - Ct @ reduced.W[points]
-    g = sum_rows(point, np.einsum("kab,kb->ka", Bt, reduced.v[on]), n)[points]
+    K -= Ct @ reduced.W[points]
     g = g - np.einsum("nab,nb->na", Ct, reduced.y[points]) - K @ (reduced.Sinv @ reduced.t)
     alone = V - Ct @ np.swapaxes(Ct, 1, 2)
     return _Moves(factor, points, alone, K, g, V, alone - K @ reduced.Sinv @ np.swapaxes(K, 1, 2))
@@ -450,40 +451,83 @@ def _as_one_body(reduced: Reduced, moves: _Moves) -> Iterator[Alternative]:
 
     The motion is then that of the set, in turn with the set, until it stays the same.
     """
-    X, K_flat = reduced.adjustment.estimate.points[moves.points], moves.K.reshape(-1, len(reduced.t))
-    earlier: set[bytes] = set()  # sets of earlier starts; from the same set, all that follows is the same
-    for first in np.argsort(-moves.single)[:STARTS]:
-        own: set[bytes] = set()
-        d = -np.linalg.lstsq(moves.blocks[first], moves.g[first], rcond=None)[0]
-        again = d @ moves.blocks @ d + 2 * moves.g @ d < 0
-        for _ in range(ROUNDS):
-            # if most points moved, the others moved in the opposite direction, which is equivalent
-            members = ~again if 2 * again.sum() > len(again) else again
-            if members.sum() < MIN_OF_BODY or members.tobytes() in earlier:
-                break
-            own.add(members.tobytes())
-            motions = rigid_motions(X, members)
-            M = np.where(members[:, None, None], motions, 0.0)  # (n, 3, 6)
-            flat = M.reshape(-1, 6)
-            K = flat.T @ K_flat
-            H = flat.T @ (moves.alone @ M).reshape(-1, 6) - K @ reduced.Sinv @ K.T
-            gain = gain_of(H, flat.T @ moves.g.ravel(), (M * (moves.squares @ M)).sum(axis=(0, 1)))
-            move = motions @ gain.beta
-            moved = np.where(members[:, None], move, 0.0)
-            left = moves.g - (K_flat @ (reduced.Sinv @ (K.T @ gain.beta))).reshape(-1, 3)
-            left += np.einsum("nij,nj->ni", moves.alone, moved)
-            # of v'Pv, by a point that changes
-            loss = (move * np.einsum("nij,nj->ni", moves.blocks, move)).sum(axis=1)
-            along = 2 * (left * move).sum(axis=1)
-            again = np.where(members, loss > along, loss + along < 0)
-            if (again == members).all():
-                break
-        known = members.tobytes() in earlier
-        earlier |= own
-        if known or members.sum() < MIN_OF_BODY:
-            continue
-        values, ranks = gains_of(moves.blocks, left, moves.squares_of_columns)
-        redundancy = int(ranks.sum()) - gain.rank
+    first = np.argsort(-moves.single)[:STARTS]
+    rounding = 3 * np.finfo(float).eps
+    inverse = np.linalg.pinv(moves.blocks[first], rcond=rounding, hermitian=True)
+    d = -(inverse @ moves.g[first][:, :, None])[:, :, 0]
+    loss = np.einsum("si,nij,sj->sn", d, moves.blocks, d, optimize=True)
+    starts = [_smaller(moved) for moved in loss + 2 * d @ moves.g.T < 0]
+    bodies, earlier = _bodies_from(reduced, moves, starts), set[bytes]()
+    for members in starts:
+        own: list[bytes] = []
+        key = members.tobytes()
+        while len(own) < ROUNDS and key in bodies and key not in earlier and key not in own[-1:]:
+            own.append(key)
+            key = bodies[key].fitting.tobytes()
+        earlier |= set(own)
+        if not own or (len(own) < ROUNDS and key != own[-1]):
+            continue  # it is none, or what follows is that of an earlier start
+        body = bodies[own[-1]]
+        values, ranks, _ = gains_of(moves.blocks, body.left, moves.squares_of_columns)
+        redundancy = int(ranks.sum()) - body.gain.rank
         spread = Spread(float(values.sum()) / redundancy, redundancy)
-        search, points = moves.log_sets(int(members.sum())), moves.points[members]
-        yield Alternative(BODY, "split", moves.factor, gain, spread, search, points)
+        points = moves.points[body.members]
+        search = moves.log_sets(len(points))
+        yield Alternative(BODY, "split", moves.factor, body.gain, spread, search, points)
+
+
+class _Body(NamedTuple):
+    """A set of points that moved by the motion of a body that fits them best."""
+
+    members: BoolArray  # (n,)
+    gain: Gain
+    left: FloatArray  # right-hand sides of all points with this motion, (n, 3)
+    fitting: BoolArray  # the points that this motion fits better than none, (n,)
+
+
+def _smaller(moved: BoolArray) -> BoolArray:
+    """Return a set of points, or the others: if most moved, they moved in the opposite direction."""
+    return ~moved if 2 * moved.sum() > len(moved) else moved
+
+
+def _bodies_from(reduced: Reduced, moves: _Moves, starts: list[BoolArray]) -> dict[bytes, _Body]:
+    """Return the bodies of some sets of points and of all sets that follow from them, each in turn."""
+    bodies: dict[bytes, _Body] = {}
+    reached = starts
+    for _ in range(ROUNDS):
+        sets = {members.tobytes(): members for members in reached if members.sum() >= MIN_OF_BODY}
+        new = [key for key in sets if key not in bodies]
+        if not new:
+            break
+        evaluated = _bodies_of(reduced, moves, np.array([sets[key] for key in new]))
+        bodies |= zip(new, evaluated, strict=True)
+        reached = [body.fitting for body in evaluated]
+    return bodies
+
+
+def _bodies_of(reduced: Reduced, moves: _Moves, sets: BoolArray) -> list[_Body]:
+    """Return the body of each set of points, (s, n); one product serves all of them."""
+    X, K = reduced.adjustment.estimate.points[moves.points], moves.K.reshape(-1, len(reduced.t))
+    s, n = sets.shape
+    motions = np.stack([rigid_motions(X, members) for members in sets], axis=2)  # (n, 3, s, 6)
+    M = np.where(sets.T[:, None, :, None], motions, 0.0).reshape(n, 3, 6 * s)
+    flat = M.reshape(3 * n, 6 * s)
+    by_cameras = flat.T @ K
+    with_cameras = by_cameras @ reduced.Sinv
+    H = flat.T @ (moves.alone @ M).reshape(3 * n, 6 * s) - with_cameras @ by_cameras.T
+    H = np.einsum("iaib->iab", H.reshape(s, 6, s, 6))
+    g = (flat.T @ moves.g.ravel()).reshape(s, 6)
+    squares = (M * (moves.squares @ M)).sum(axis=(0, 1)).reshape(s, 6)
+    values, ranks, beta = gains_of(H, g, squares)
+    move = np.einsum("ncsi,si->ncs", motions, beta)
+    through = np.einsum("sia,si->as", with_cameras.reshape(s, 6, -1), beta)
+    left = moves.g[:, :, None] - (K @ through).reshape(n, 3, s)
+    left += moves.alone @ np.where(sets.T[:, None], move, 0.0)
+    # of v'Pv, by a point that changes
+    loss = (move * (moves.blocks @ move)).sum(axis=1)
+    along = 2 * (left * move).sum(axis=1)
+    moved = np.where(sets.T, loss > along, loss + along < 0).T
+    return [
+        _Body(members, Gain(float(values[b]), int(ranks[b]), beta[b]), left[:, :, b], _smaller(moved[b]))
+        for b, members in enumerate(sets)
+    ]

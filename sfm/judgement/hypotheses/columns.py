@@ -14,6 +14,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from functools import cached_property
 
 import numpy as np
 
@@ -23,6 +24,7 @@ from sfm.model.conventions import BoolArray, FloatArray, IntArray, skew
 from sfm.model.distortion.models import Role
 from sfm.model.network import rows_of
 from sfm.model.similarity import mean_distance
+from sfm.runtime.compiling import compiled
 
 CAMERA = ("c", "x0", "y0", "K1", "K2", "P1", "P2", "b1", "b2")
 CAMERA_ROLES = (
@@ -46,52 +48,92 @@ BENDING_PLACES = tuple(range(len(CAMERA) + STRAIN, len(CAMERA) + STRAIN + BENDIN
 class Columns:
     """Derivatives of the k image points of an adjustment, including rejected ones, px."""
 
+    adjustment: Adjustment
     exterior: FloatArray  # derivatives by X0 and small rotation of the photograph, (k, 2, 6)
     point: FloatArray  # derivatives by the object point, (k, 2, 3)
-    freedoms: FloatArray
-    """by the freedoms of a single photograph: `CAMERA`, px at the edge of the photograph, then strain and
-    bending of the object, with its size as unit, (k, 2, 9 + 5 + 18)"""
-    usable: BoolArray  # whether all of these are finite, (k,)
+    usable: BoolArray  # whether all of these are finite, (k,); the others are 0
+
+    @cached_property
+    def freedoms(self) -> FloatArray:
+        """Derivatives by the freedoms of a single photograph, (k, 2, 9 + 5 + 18).
+
+        They are those of `CAMERA`, px at the edge of the photograph, then strain and bending of the object,
+        with its size as unit.
+        """
+        network, estimate = self.adjustment.network, self.adjustment.estimate
+        seen = network.image_points
+        UVW = _in_photographs(self.adjustment, np.arange(len(seen)))
+        uv = -UVW[:, :2] / UVW[:, 2:]
+        freedoms, flat = np.empty((len(seen), 2, len(CAMERA) + STRAIN + BENDING)), np.empty((len(seen), 2))
+        for camera, rows in zip(
+            estimate.cameras, rows_of(network.camera[seen.image], len(estimate.cameras)), strict=True
+        ):
+            if len(rows):
+                half, focal = max(camera.size_px) / 2, camera.plays(Role.FOCAL)
+                flat[rows] = uv[rows] * camera.c_px / half
+                # with another c, the same rays pass through other parts of the distortion
+                by_focal = parameter_jacobian(camera, uv[rows])[:, :, focal] @ camera.parameters[focal]
+                freedoms[rows, :, 0] = np.nan_to_num(by_focal) / half
+        # the freedoms of a camera other than c, 1 px at the edge, by tangents over that of half the side
+        x, y = flat.T
+        r2, ones, zero = x**2 + y**2, np.ones(len(seen)), np.zeros(len(seen))
+        across = [ones, zero, x * r2, x * r2**2, r2 + 2 * x**2, 2 * x * y, x, y]
+        down = [zero, ones, y * r2, y * r2**2, 2 * x * y, r2 + 2 * y**2, zero, zero]
+        freedoms[:, 0, 1 : len(CAMERA)] = np.stack(across, -1)
+        freedoms[:, 1, 1 : len(CAMERA)] = -np.stack(down, -1)
+        fields = object_fields(estimate.points)[0]
+        freedoms[:, :, len(CAMERA) :] = self.point @ fields[seen.point]
+        freedoms[~self.usable] = 0.0
+        return freedoms
 
 
 def columns_of(a: Adjustment) -> Columns:
     """Return the derivatives of all image points of an adjustment."""
     network, estimate = a.network, a.estimate
     seen = network.image_points
-    R, UVW = estimate.rotation[seen.image], _in_photographs(a, np.arange(len(seen)))
-    W = UVW[:, 2]
-    uv = -UVW[:, :2] / W[:, None]
-    k = len(seen)
-    J, flat, by_c = np.zeros((k, 2, 2)), np.zeros((k, 2)), np.zeros((k, 2))
+    UVW, k = _in_photographs(a, np.arange(len(seen))), len(seen)
+    J = np.zeros((k, 2, 2))
     for camera, rows in zip(
         estimate.cameras, rows_of(network.camera[seen.image], len(estimate.cameras)), strict=True
     ):
         if len(rows):
-            half, focal = max(camera.size_px) / 2, camera.plays(Role.FOCAL)
             J[rows] = pixel_jacobian(camera, seen.xy[rows])
-            flat[rows] = uv[rows] * camera.c_px / half
-            # with another c, the same rays pass through other parts of the distortion
-            by_focal = parameter_jacobian(camera, uv[rows])[:, :, focal] @ camera.parameters[focal]
-            by_c[rows] = np.nan_to_num(by_focal) / half
-    # d (u, v) / d (U, V, W) = -(1, 0, u) / W
-    by_axes = -np.concatenate([np.tile(np.eye(2), (k, 1, 1)), uv[:, :, None]], axis=2) / W[:, None, None]
-    by_axes = J @ by_axes
-    point = by_axes @ np.swapaxes(R, 1, 2)
-    exterior = np.concatenate([-point, by_axes @ skew(UVW)], axis=2)
-    by_object = np.einsum("kac,kcf->kaf", point, object_fields(estimate.points)[0][seen.point])
-    usable = np.isfinite(point).all(axis=(1, 2)) & (W < 0)
-    # the freedoms of a camera other than c, 1 px at the edge, by tangents over that of half the longer side
-    x, y = flat.T
-    r2, ones, zero = x**2 + y**2, np.ones(k), np.zeros(k)
-    across = [ones, zero, x * r2, x * r2**2, r2 + 2 * x**2, 2 * x * y, x, y]
-    down = [zero, ones, y * r2, y * r2**2, 2 * x * y, r2 + 2 * y**2, zero, zero]
-    by_camera = np.stack([np.stack(across, -1), -np.stack(down, -1)], axis=1)
-    columns = Columns(
-        exterior, point, np.concatenate([by_c[:, :, None], by_camera, by_object], axis=2), usable
-    )
-    for part in (columns.exterior, columns.point, columns.freedoms):
+    exterior, point = np.empty((k, 2, 6)), np.empty((k, 2, 3))
+    _by_poses_and_points(J, UVW, np.ascontiguousarray(estimate.rotation), seen.image, exterior, point)
+    usable = np.isfinite(point).all(axis=(1, 2)) & (UVW[:, 2] < 0)
+    for part in (exterior, point):
         part[~usable] = 0.0
-    return columns
+    return Columns(a, exterior, point, usable)
+
+
+@compiled
+def _by_poses_and_points(
+    J: FloatArray, UVW: FloatArray, R: FloatArray, image: IntArray, exterior: FloatArray, point: FloatArray
+) -> None:
+    """Fill the derivatives of image points by X0 and small rotation, (k, 2, 6), and by the point, (k, 2, 3).
+
+    Args:
+        J: derivatives by the tangents u = -U / W and v = -V / W, (k, 2, 2).
+        UVW: object points in the system of their photograph, (k, 3).
+        R: rotations of the photographs, (m, 3, 3).
+        image: photograph of each image point, (k,).
+        exterior: to fill.
+        point: to fill.
+    """
+    for k in range(len(J)):
+        U, V, W = UVW[k, 0], UVW[k, 1], UVW[k, 2]
+        turn = R[image[k]]
+        for row in range(2):
+            # d (u, v) / d (U, V, W) = -(1, 0, u) / W
+            a, b = -J[k, row, 0] / W, -J[k, row, 1] / W
+            c = -(a * U + b * V) / W
+            for axis in range(3):
+                by_axis = a * turn[axis, 0] + b * turn[axis, 1] + c * turn[axis, 2]
+                point[k, row, axis] = by_axis
+                exterior[k, row, axis] = -by_axis
+            exterior[k, row, 3] = b * W - c * V
+            exterior[k, row, 4] = c * U - a * W
+            exterior[k, row, 5] = a * V - b * U
 
 
 def object_fields(points: FloatArray) -> tuple[FloatArray, float]:

@@ -341,7 +341,8 @@ def _best(
     """
     current = causes[-1].refit.adjustment if causes else plain
     before = [(cause.alternative, cause.refit.beta) for cause in causes]
-    reduced = reduce_adjustment(current)
+    kept = causes[-1].refit.reduced if causes else None
+    reduced = kept or reduce_adjustment(current)
     every, level = alternatives_of(reduced), plain.levels.family
     to_try = _to_adjust(every, level)
     work = max(len(to_try), 1) * len(plain.network.images) ** 3
@@ -351,6 +352,8 @@ def _best(
         if causes and evidence >= asked:
             beyond = _beyond_spread(alternative, refitted, reduced.redundancy, before)
             evidence = min(evidence, beyond - alternative.price)
+        if holding and not evidence > max(tried.evidence for tried in holding):
+            refitted = replace(refitted, reduced=None)  # only that of the best is needed
         holding.append(_Adjusted(evidence, alternative, refitted))
 
     def least_asked() -> float:
@@ -361,7 +364,10 @@ def _best(
         most = int(MAX_WORK / work)
         for alternative in alternatives:
             asked = least_asked()
-            refitted = refit(plain, alternative, current, before, asked=asked + alternative.price, most=most)
+            asked_gain, columns = asked + alternative.price, reduced.columns
+            refitted = refit(
+                plain, alternative, current, before, asked=asked_gain, most=most, columns=columns
+            )
             if refitted is not None:
                 judge(alternative, refitted, asked)
 
@@ -474,11 +480,13 @@ def _still_needed(plain: Adjustment, causes: tuple[Cause, ...], latest: Cause) -
         others = [(known.alternative, beta) for known, beta in before]
         price = cause.alternative.price + np.log(1 / plain.levels.family)
         loss = cause.alternative.inflated(price, plain.redundancy)  # with so much, it is needed
-        alone = refit(plain, new, latest.refit.adjustment, others, least=-np.inf, asked=-loss)
+        start, reduced = latest.refit.adjustment, latest.refit.reduced
+        columns = None if reduced is None else reduced.columns
+        alone = refit(plain, new, start, others, least=-np.inf, asked=-loss, columns=columns)
         if alone is not None and -alone.gain < loss:
             causes, latest = tuple(known for known, _ in before), replace(latest, refit=alone)
     joint = zip(causes, latest.refit.before, strict=True)
-    kept = tuple(replace(known, refit=replace(known.refit, beta=beta)) for known, beta in joint)
+    kept = tuple(replace(known, refit=replace(known.refit, beta=beta, reduced=None)) for known, beta in joint)
     return (*kept, latest)
 
 
@@ -487,7 +495,8 @@ def _with_joint_shifts(plain: Adjustment, causes: tuple[Cause, ...]) -> tuple[Ca
     if len(causes) < 2:
         return causes
     last, shifted = causes[-1].refit.adjustment, []
-    columns, seen = columns_of(last), last.network.image_points
+    reduced, seen = causes[-1].refit.reduced, last.network.image_points
+    columns = columns_of(last) if reduced is None else reduced.columns
     for cause in causes:
         alternative, beta = cause.alternative, cause.refit.beta
         with_effect = replace(seen, xy=seen.xy + alternative.columns(last, columns) @ beta)

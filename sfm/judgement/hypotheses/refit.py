@@ -44,7 +44,9 @@ from sfm.judgement.hypotheses.families import (
 )
 from sfm.judgement.hypotheses.score import (
     MIN_DETERMINED_SHARE,
+    ROUNDING,
     Reduced,
+    determined_inverse,
     directions_of,
     gain_of,
     least_share,
@@ -77,6 +79,7 @@ class Refit:
     rms: float  # root mean square of these changes; NaN of cameras
     before: tuple[FloatArray, ...] = ()  # parameters of the earlier alternatives
     finished: bool = True  # whether the rounds ended before the largest number of adjustments
+    reduced: Reduced | None = None  # its adjustment with all unknowns eliminated, if that is kept
 
 
 def refit(
@@ -88,6 +91,7 @@ def refit(
     least: float = 0.0,
     asked: float = -np.inf,
     most: int = ROUNDS * HALVINGS,
+    columns: Columns | None = None,
 ) -> Refit | None:
     """Adjust with an alternative; None if the adjustment does not converge.
 
@@ -99,12 +103,13 @@ def refit(
         least: gain of ln likelihood below which a step is halved.
         asked: gain of ln likelihood that is asked for; the rounds end when it is out of reach.
         most: number of adjustments after which no further round begins.
+        columns: derivatives of the image points of the start; they are computed if not given.
     """
     every = [other for other, _ in before] + [alternative]
     betas = [beta for _, beta in before] + [alternative.gain.beta]
     ends, beta = np.cumsum([0] + [len(beta) for beta in betas]), np.concatenate(betas)
     current, step = start, np.concatenate([np.zeros(int(ends[-2])), alternative.gain.beta])
-    D = _side_by_side(every, current, columns_of(current))
+    D = _side_by_side(every, current, columns or columns_of(current))
     before_all = log_likelihood_of(start)
     taken, finished, likelihoods = 0, True, [before_all + least]
     for number in range(ROUNDS):
@@ -130,7 +135,7 @@ def refit(
     gained = likelihoods[-1] - before_all
     parts = [beta[ends[k] : ends[k + 1]] for k in range(len(every))]
     shift, rms = shifts_of(plain, start, current, alternative, parts[-1])
-    return Refit(current, parts[-1], gained, shift, rms, tuple(parts[:-1]), finished)
+    return Refit(current, parts[-1], gained, shift, rms, tuple(parts[:-1]), finished, reduced)
 
 
 def _stepped(
@@ -158,6 +163,8 @@ def _stepped(
 def readjusted(plain: Adjustment, network: Network, start: Adjustment) -> Adjustment | None:
     """Adjust other image points of a network as it was adjusted; None without a tested solution.
 
+    Its covariance is not computed.
+
     Args:
         plain: adjustment of the network, with the datum, weights and level of rejection.
         network: the network with the other image points.
@@ -171,8 +178,10 @@ def readjusted(plain: Adjustment, network: Network, start: Adjustment) -> Adjust
             reject="tau",
             false_alarm=plain.false_alarm,
             rejected=start.rejected,
+            covariance=bool((network.share < 1).any()),  # for what errors in common leave of the redundancy
             options=AdjustmentOptions(
                 image_sigma_factor=plain.image_sigma_factor,
+                method="gauss-newton",
                 alpha=plain.test_alpha,
                 max_iterations=MAX_ITERATIONS,
             ),
@@ -257,16 +266,17 @@ def spread_of_photographs(refitted: Refit, alternative: Alternative, others: Seq
 
     Source: White (1982), Econometrica 50, for a score test with dependent observations.
     """
-    reduced = reduce_adjustment(refitted.adjustment)
+    reduced = refitted.reduced or reduce_adjustment(refitted.adjustment)
     effect = alternative.whitened(reduced) @ refitted.beta
-    left = reduced.absorb(effect[:, :, None])[2].ravel()
+    left = reduced.absorb(effect[:, :, None])[2]
     if others:
         taken = reduced.whiten(_side_by_side(others, reduced.adjustment, reduced.columns))
-        taken = reduced.absorb(taken)[2]
-        taken = taken.reshape(len(left), -1)
-        left = left - taken @ np.linalg.lstsq(taken, left, rcond=None)[0]
+        H, _, squares = reduced.project(taken)
+        share = determined_inverse(H, squares, ROUNDING) @ (taken.reshape(-1, len(H)).T @ left.ravel())
+        left = left - reduced.absorb((taken @ share)[:, :, None])[2]
+    left = left[:, :, 0]
     m = reduced.photographs
-    slope = np.bincount(reduced.image, (reduced.v * left.reshape(-1, 2)).sum(axis=1), minlength=m)
+    slope = np.bincount(reduced.image, (reduced.v * left).sum(axis=1), minlength=m)
     return float(slope @ slope / (left**2).sum()) * m / (m - 1)
 
 

@@ -28,9 +28,8 @@ from sfm.adjustment.result import Adjustment
 from sfm.judgement.hypotheses.columns import Columns, columns_of, interior_columns
 from sfm.model.conventions import BoolArray, FloatArray, IntArray
 from sfm.model.distributions import f_sf
-from sfm.model.network import rows_of, sum_rows
 from sfm.model.similarity import similarity_motions
-from sfm.runtime.compiling import compiled
+from sfm.runtime.compiling import compiled, inlined
 
 # Share of the squares of combined columns that must remain after eliminating photographs, cameras and points.
 MIN_DETERMINED_SHARE = 1e-5
@@ -86,15 +85,13 @@ class Reduced:
         Every run of photographs (m,) has f separate freedoms.
         """
         count, f = int(run.max()) + 1, D.shape[2]
-        H, g, squares = np.zeros((count, f, count, f)), np.zeros((count, f)), np.zeros((count, f))
-        for u, rows in enumerate(rows_of(run[self.image], count)):
-            flat = D[rows].reshape(-1, f)
-            H[u, :, u] = flat.T @ flat
-            g[u] = flat.T @ self.v[rows].ravel()
-            squares[u] = np.einsum("kq,kq->q", flat, flat)
         C, K = self._eliminated(D, run)
-        H -= (C.T @ C + K.T @ (self.Sinv @ K)).reshape(count, f, count, f)
-        g -= (C.T @ self.y.ravel() + K.T @ (self.Sinv @ self.t)).reshape(count, f)
+        flat = C.T @ C
+        flat += K.T @ (self.Sinv @ K)
+        H = -flat.reshape(count, f, count, f)
+        g = -(C.T @ self.y.ravel() + K.T @ (self.Sinv @ self.t)).reshape(count, f)
+        squares = np.zeros((count, f))
+        _add_normals(np.ascontiguousarray(D), self.v, run[self.image], H, g, squares)
         return H, g, squares
 
     def project(self, D: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray]:
@@ -192,18 +189,72 @@ def _sum_products(
         by_cameras: sums of m photographs, 6 rows each, and of i interior parameters.
         m: number of photographs.
     """
-    f = D.shape[2]
+    ends = np.empty(D.shape[2] + 1, dtype=np.int64)
     for k in range(len(D)):
         u, x, y = run[k], D[k, 0], D[k, 1]
-        for c in range(3):
-            total = by_points[point[k], c, u]
-            for j in range(f):
-                total[j] += B[k, 0, c] * x[j] + B[k, 1, c] * y[j]
-        for c in range(A.shape[2]):
-            row = 6 * image[k] + c if c < 6 else 6 * (m - 1) + c
-            total = by_cameras[row, u]
-            for j in range(f):
-                total[j] += A[k, 0, c] * x[j] + A[k, 1, c] * y[j]
+        stretches = _stretches(x, y, ends)
+        for c in range(3 + A.shape[2]):
+            if c < 3:
+                a, b, total = B[k, 0, c], B[k, 1, c], by_points[point[k], c, u]
+            else:
+                row = 6 * image[k] + c - 3 if c < 9 else 6 * (m - 1) + c - 3
+                a, b, total = A[k, 0, c - 3], A[k, 1, c - 3], by_cameras[row, u]
+            if a != 0.0 or b != 0.0:
+                for s in range(0, stretches, 2):
+                    for j in range(ends[s], ends[s + 1]):
+                        total[j] += a * x[j] + b * y[j]
+
+
+@compiled
+def _add_normals(
+    D: FloatArray, v: FloatArray, run: IntArray, H: FloatArray, g: FloatArray, squares: FloatArray
+) -> None:
+    """Add D'D to the diagonal blocks of H, (u, f, u, f), and D'v to g, (u, f), of each run of photographs.
+
+    Args:
+        D: columns, (k, 2, f).
+        v: residuals, (k, 2).
+        run: run of each image point, (k,).
+        H: normal equations.
+        g: right-hand sides.
+        squares: receives the squares of the columns, (u, f).
+    """
+    f, count = D.shape[2], len(g)
+    N, ends = np.zeros((count, f, f)), np.empty(f + 1, dtype=np.int64)
+    for k in range(len(D)):
+        u, x, y = run[k], D[k, 0], D[k, 1]
+        stretches = _stretches(x, y, ends)
+        for r in range(0, stretches, 2):
+            for i in range(ends[r], ends[r + 1]):
+                a, b, row = x[i], y[i], N[u, i]
+                g[u, i] += a * v[k, 0] + b * v[k, 1]
+                for j in range(i, ends[r + 1]):
+                    row[j] += a * x[j] + b * y[j]
+                for s in range(r + 2, stretches, 2):
+                    for j in range(ends[s], ends[s + 1]):
+                        row[j] += a * x[j] + b * y[j]
+    for u in range(count):
+        for i in range(f):
+            squares[u, i] = N[u, i, i]
+            H[u, i, u, i] += N[u, i, i]
+            for j in range(i + 1, f):
+                H[u, i, u, j] += N[u, i, j]
+                H[u, j, u, i] += N[u, i, j]
+
+
+@inlined
+def _stretches(x: FloatArray, y: FloatArray, ends: IntArray) -> int:
+    """Fill in the first and end of each stretch of columns that are not 0; return how many these are."""
+    count, within = 0, False
+    for j in range(len(x)):
+        moves = x[j] != 0.0 or y[j] != 0.0
+        if moves != within:
+            ends[count] = j
+            count, within = count + 1, moves
+    if within:
+        ends[count] = len(x)
+        count += 1
+    return count
 
 
 def reduce_adjustment(a: Adjustment) -> Reduced:
@@ -226,17 +277,18 @@ def reduce_adjustment(a: Adjustment) -> Reduced:
     P = np.linalg.inv(a.image_covariance[used]) * (share / a.sigma0**2)[:, None, None]
     F = np.swapaxes(np.linalg.cholesky(P), 1, 2)
     image, point = seen.image[used], seen.point[used]
-    v = np.einsum("kab,kb->ka", F, a.residuals[used])
-    B = np.where(fixed[point][:, None], 0.0, F @ columns.point[used])
     interior, prior, slope = _free_interior(a)
-    A = np.concatenate([F @ columns.exterior[used], F @ interior[used]], axis=2)
+    v, B = np.empty((len(used), 2)), np.empty((len(used), 2, 3))
+    A = np.empty((len(used), 2, 6 + interior.shape[2]))
+    _whiten(used, np.ascontiguousarray(F), a.residuals, columns.point, columns.exterior, interior, v, B, A)
+    if fixed.any():
+        B[np.swapaxes(np.broadcast_to(fixed[point, :, None], (len(used), 3, 2)), 1, 2)] = 0.0
     size = 6 * m + interior.shape[2]
-    Bt = np.swapaxes(B, 1, 2)
-    V = sum_rows(point, Bt @ B, n) + weight
-    gp = sum_rows(point, np.einsum("kab,kb->ka", Bt, v), n) + slope_of_given
+    V, gp, W = weight, slope_of_given, np.zeros((n, 3, size))
+    add_to_points(B, A, v, image, point, m, V, gp, W)
     V[~V.any(axis=2)] += np.tile(np.eye(3), (n, 1, 1))[~V.any(axis=2)]  # fixed or not seen
     L = np.linalg.inv(np.linalg.cholesky(V))
-    W = L @ points_by_cameras(Bt @ A, point, image, n, m)
+    W = L @ W
     y = np.einsum("nab,nb->na", L, gp)
     flat = W.reshape(3 * n, size)
     S, t = _camera_normals(A, image, v, m, size)
@@ -284,21 +336,68 @@ def _given_points(a: Adjustment) -> tuple[FloatArray, FloatArray, BoolArray]:
     return weight, slope, fixed
 
 
-def points_by_cameras(by: FloatArray, point: IntArray, image: IntArray, n: int, m: int) -> FloatArray:
-    """Return B'A of object points x photographs and cameras, (n, 3, 6 m + i).
+@compiled
+def _whiten(
+    used: IntArray, F: FloatArray, residuals: FloatArray, by_point: FloatArray, by_pose: FloatArray,
+    by_interior: FloatArray, v: FloatArray, B: FloatArray, A: FloatArray,
+) -> None:  # fmt: skip
+    """Fill the whitened residuals v and derivatives B and A, see `Reduced`, of the accepted image points.
 
     Args:
-        by: B'A of each image point, (k, 3, 6 + i).
-        point: object point of each image point, (k,).
-        image: photograph of each image point, (k,).
-        n: number of points.
-        m: number of photographs.
+        used: accepted image points, (k,).
+        F: upper triangular whitening of each of them, (k, 2, 2).
+        residuals: residuals of all image points, (all, 2).
+        by_point: derivatives by object points, (all, 2, 3).
+        by_pose: derivatives by photographs, (all, 2, 6).
+        by_interior: derivatives by free interior parameters, (all, 2, i).
+        v: to fill.
+        B: to fill.
+        A: to fill.
     """
-    products = np.zeros((n, 3, 6 * m + by.shape[2] - 6))
-    every = sum_rows(point * m + image, by[:, :, :6], n * m).reshape(n, m, 3, 6)
-    products[:, :, : 6 * m] = np.moveaxis(every, 1, 2).reshape(n, 3, 6 * m)
-    products[:, :, 6 * m :] = sum_rows(point, by[:, :, 6:], n)
-    return products
+    for k in range(len(used)):
+        o, a, b, c = used[k], F[k, 0, 0], F[k, 0, 1], F[k, 1, 1]
+        v[k, 0] = a * residuals[o, 0] + b * residuals[o, 1]
+        v[k, 1] = c * residuals[o, 1]
+        for p in range(3):
+            B[k, 0, p] = a * by_point[o, 0, p] + b * by_point[o, 1, p]
+            B[k, 1, p] = c * by_point[o, 1, p]
+        for p in range(6):
+            A[k, 0, p] = a * by_pose[o, 0, p] + b * by_pose[o, 1, p]
+            A[k, 1, p] = c * by_pose[o, 1, p]
+        for p in range(by_interior.shape[2]):
+            A[k, 0, 6 + p] = a * by_interior[o, 0, p] + b * by_interior[o, 1, p]
+            A[k, 1, 6 + p] = c * by_interior[o, 1, p]
+
+
+@compiled
+def add_to_points(
+    B: FloatArray, A: FloatArray, v: FloatArray, image: IntArray, point: IntArray, m: int,
+    V: FloatArray, g: FloatArray, W: FloatArray,
+) -> None:  # fmt: skip
+    """Add B'B, B'v and B'A of image points to their object points.
+
+    Args:
+        B: derivatives by object points, (k, 2, 3).
+        A: those by photographs and interior parameters, (k, 2, 6 + i).
+        v: residuals, (k, 2).
+        image: photograph of each image point, (k,).
+        point: object point of each image point, (k,).
+        m: number of photographs.
+        V: sums of B'B, (n, 3, 3).
+        g: sums of B'v, (n, 3).
+        W: sums of B'A by m photographs, 6 columns each, and by i interior parameters, (n, 3, 6 m + i).
+    """
+    for k in range(len(B)):
+        j, first = point[k], 6 * image[k]
+        for p in range(3):
+            a, b, row = B[k, 0, p], B[k, 1, p], W[j, p]
+            g[j, p] += a * v[k, 0] + b * v[k, 1]
+            for q in range(3):
+                V[j, p, q] += a * B[k, 0, q] + b * B[k, 1, q]
+            for q in range(6):
+                row[first + q] += a * A[k, 0, q] + b * A[k, 1, q]
+            for q in range(6, A.shape[2]):
+                row[6 * (m - 1) + q] += a * A[k, 0, q] + b * A[k, 1, q]
 
 
 def _free_interior(a: Adjustment) -> tuple[FloatArray, FloatArray, FloatArray]:
@@ -324,21 +423,27 @@ def _free_interior(a: Adjustment) -> tuple[FloatArray, FloatArray, FloatArray]:
     return columns, J.T @ P @ J, J.T @ P @ np.array(off)
 
 
+@compiled
 def _camera_normals(
     A: FloatArray, image: IntArray, v: FloatArray, m: int, size: int
 ) -> tuple[FloatArray, FloatArray]:
     """Return A'A (a, a) and A'v (a,) of photographs and cameras."""
     S, t = np.zeros((size, size)), np.zeros(size)
-    for i, rows in enumerate(rows_of(image, m)):
-        pose = slice(6 * i, 6 * i + 6)
-        of_photograph = A[rows].reshape(2 * len(rows), A.shape[2])
-        N, b = of_photograph.T @ of_photograph, of_photograph.T @ v[rows].ravel()
-        S[pose, pose] = N[:6, :6]
-        S[pose, 6 * m :] = N[:6, 6:]
-        S[6 * m :, pose] = N[6:, :6]
-        S[6 * m :, 6 * m :] += N[6:, 6:]
-        t[pose] = b[:6]
-        t[6 * m :] += b[6:]
+    for k in range(len(A)):
+        x, y, own, common = A[k, 0], A[k, 1], 6 * image[k], 6 * (m - 1)
+        for p in range(A.shape[2]):
+            a, b = x[p], y[p]
+            if a != 0.0 or b != 0.0:  # of another camera
+                row = own + p if p < 6 else common + p
+                t[row] += a * v[k, 0] + b * v[k, 1]
+                total = S[row]
+                for q in range(p, 6):
+                    total[own + q] += a * x[q] + b * y[q]
+                for q in range(max(p, 6), A.shape[2]):
+                    total[common + q] += a * x[q] + b * y[q]
+    for row in range(size):
+        for column in range(row):
+            S[row, column] = S[column, row]
     return S, t
 
 
@@ -409,21 +514,24 @@ def gain_of(H: FloatArray, g: FloatArray, squares: FloatArray, least: float = MI
     return Gain(float((projected**2 / values[good]).sum()), int(good.sum()), beta)
 
 
-def determined_inverse(H: FloatArray, squares: FloatArray) -> FloatArray:
+def determined_inverse(H: FloatArray, squares: FloatArray, least: float = MIN_DETERMINED_SHARE) -> FloatArray:
     """Return the inverse of normal equations in the directions that are determined, as in `gain_of`."""
     values, vectors, scale = directions_of(H, squares)
-    good = values > MIN_DETERMINED_SHARE
+    good = values > least
     half = scale[:, None] * vectors[:, good] / np.sqrt(values[good])
     return np.asarray(half @ half.T)
 
 
-def gains_of(H: FloatArray, g: FloatArray, squares: FloatArray) -> tuple[FloatArray, IntArray]:
-    """Return the gains (n,) and ranks (n,) of separate alternatives, with arrays (n, ...) as in `gain_of`."""
+def gains_of(
+    H: FloatArray, g: FloatArray, squares: FloatArray, least: float = MIN_DETERMINED_SHARE
+) -> tuple[FloatArray, IntArray, FloatArray]:
+    """Return gains (n,), ranks (n,) and steps (n, q) of separate alternatives, see `gain_of`."""
     values, vectors, scale = directions_of(H, squares)
-    good = values > MIN_DETERMINED_SHARE
+    good = values > least
     projected = np.einsum("nij,ni->nj", vectors, scale * g)
-    gains = np.where(good, projected**2 / np.where(good, values, 1.0), 0.0).sum(axis=1)
-    return np.asarray(gains), np.asarray(good.sum(axis=1))
+    steps = np.where(good, projected / np.where(good, values, 1.0), 0.0)
+    beta = -scale * np.einsum("nij,nj->ni", vectors, steps)
+    return (projected * steps).sum(axis=1), good.sum(axis=1), beta
 
 
 def log_probability(gain: float, q: int, redundancy: int) -> float:
