@@ -28,6 +28,7 @@ from sfm.runtime.compiling import kernel
 # Ratio of a variance to its limiting value below which the datum fixes the coordinate. Survey observations
 # of a point may be that much better than its rays; there, it is the ratio to the variance in any datum.
 MAX_FIXED_VARIANCE, MAX_ROUNDING = 1e-9, 1e-13
+NO_DATUM_TERMS = np.zeros((0, 0)), np.zeros((0, 0, 3)), np.zeros((0, 0))
 
 
 @dataclass(frozen=True)
@@ -51,13 +52,14 @@ class Cofactors:
         return len(self.cross) > 0
 
 
-def cofactors(optimum: Optimum, layout: Unknowns, *, cross: bool = True) -> Cofactors:
+def cofactors(optimum: Optimum, layout: Unknowns, *, cross: bool = True, datum: bool = True) -> Cofactors:
     """Return the cofactors at an optimum.
 
     Args:
         optimum: undamped normal equations and their factor.
         layout: order of the unknowns.
         cross: whether to compute cofactors between points and photographs; they are empty otherwise.
+        datum: whether to compute the terms of the S-transformation; they are empty otherwise.
     """
     equations, L = optimum.equations, optimum.equations.lower
     q = optimum.factor.inverse(equations, cross=cross)
@@ -74,7 +76,7 @@ def cofactors(optimum: Optimum, layout: Unknowns, *, cross: bool = True) -> Cofa
     points *= mask[:, :, None] * mask[:, None, :]
     limiting *= mask[:, :, None] * mask[:, None, :]
     rays, inner = _cross(layout, q, L, mask)
-    F_c, F_p, G = _datum_terms(optimum, layout, limiting)
+    F_c, F_p, G = _datum_terms(optimum, layout, limiting) if datum else NO_DATUM_TERMS
     return Cofactors(q.exterior, q.border, q.mixed, points, limiting, rays, inner, F_c, F_p, G)
 
 
@@ -257,8 +259,9 @@ def _cross(layout: Unknowns, q: Inverse, L: FloatArray, mask: FloatArray) -> tup
     if len(q.YQ) == 0:
         return q.YQ, q.YQ_border
     point, first = layout.observations.point, 6 * len(q.exterior)
-    rays = -solve_transposed(L[point], q.YQ) * mask[point][:, :, None]
-    inner = -solve_transposed(L, q.YQ_border) * mask[:, :, None]
+    rays, inner = np.empty_like(q.YQ), np.empty_like(q.YQ_border)
+    _back_to_points(L, mask, point, q.YQ, rays)
+    _back_to_points(L, mask, np.arange(len(L)), q.YQ_border, inner)
     mixed = q.mixed.reshape(len(q.exterior), 6, -1)
     for s, j in enumerate(layout.kept):
         at = slice(layout.kept_start - first + 3 * s, layout.kept_start - first + 3 * s + 3)
@@ -266,6 +269,30 @@ def _cross(layout: Unknowns, q: Inverse, L: FloatArray, mask: FloatArray) -> tup
         rays[seen] = np.swapaxes(mixed[layout.observations.pose[seen], :, at], 1, 2)
         inner[j] = q.border[at]
     return rays, inner
+
+
+@kernel
+def _back_to_points(
+    L: FloatArray, mask: FloatArray, point: IntArray, YQ: FloatArray, cross: FloatArray
+) -> None:
+    """Fill in -L^-T Y'S^-1, (r, 3, q); 0 for fixed coordinates.
+
+    Args:
+        L: Cholesky factors of object points, (n, 3, 3).
+        mask: 1 for free coordinates, (n, 3).
+        point: object point of each row, (r,).
+        YQ: Y'S^-1, (r, 3, q).
+        cross: to fill.
+    """
+    for r in range(len(point)):
+        j = point[r]
+        for q in range(YQ.shape[2]):
+            z = YQ[r, 2, q] / L[j, 2, 2]
+            y = (YQ[r, 1, q] - L[j, 2, 1] * z) / L[j, 1, 1]
+            x = (YQ[r, 0, q] - L[j, 1, 0] * y - L[j, 2, 0] * z) / L[j, 0, 0]
+            cross[r, 0, q] = -x * mask[j, 0]
+            cross[r, 1, q] = -y * mask[j, 1]
+            cross[r, 2, q] = -z * mask[j, 2]
 
 
 @kernel

@@ -384,11 +384,11 @@ def standardised_residuals(
         complement: I - A Q A' in whitened coordinates, shape (k, 2, 2).
         whitening: a, b, c of F = (a 0; b c) with F'F = P, shape (k, 3).
     """
-    F = whitening_matrix(whitening)
-    Ft = np.swapaxes(F, 1, 2)
-    Pv = np.einsum("kab,kb->ka", Ft @ F, residuals)
+    a, b, c = whitening.T
+    x, y = residuals.T
+    P = np.stack([a * a + b * b, c * c], axis=1)
+    Pv = np.stack([P[:, 0] * x + b * c * y, b * c * x + P[:, 1] * y], axis=1)
     PQP = residual_weights(complement, whitening)
-    P = np.diagonal(Ft @ F, axis1=1, axis2=2)
     controlled = PQP > MIN_CHECKED_REDUNDANCY * P
     return np.where(controlled, Pv / np.sqrt(np.where(controlled, PQP, 1.0)), 0.0)
 
@@ -400,9 +400,11 @@ def residual_weights(complement: FloatArray, whitening: FloatArray) -> FloatArra
         complement: I - A Q A' in whitened coordinates, shape (k, 2, 2).
         whitening: a, b, c of F = (a 0; b c) with F'F = P, shape (k, 3).
     """
-    F = whitening_matrix(whitening)
+    a, b, c = whitening.T
+    across = complement[:, 0, 1] + complement[:, 1, 0]
     with np.errstate(invalid="ignore"):  # the cofactors of a ray that nothing determines are infinite
-        return np.diagonal(np.swapaxes(F, 1, 2) @ complement @ F, axis1=1, axis2=2).copy()
+        along_x = a * a * complement[:, 0, 0] + a * b * across + b * b * complement[:, 1, 1]
+        return np.stack([along_x, c * c * complement[:, 1, 1]], axis=1)
 
 
 MIN_CHECKED_REDUNDANCY = 1e-6  # redundancy number below which an observation has no check

@@ -509,8 +509,8 @@ def _bodies_of(reduced: Reduced, moves: _Moves, sets: BoolArray) -> list[_Body]:
     """Return the body of each set of points, (s, n); one product serves all of them."""
     X, K = reduced.adjustment.estimate.points[moves.points], moves.K.reshape(-1, len(reduced.t))
     s, n = sets.shape
-    motions = np.stack([rigid_motions(X, members) for members in sets], axis=2)  # (n, 3, s, 6)
-    M = np.where(sets.T[:, None, :, None], motions, 0.0).reshape(n, 3, 6 * s)
+    motions = rigid_motions(X, sets)
+    M = np.moveaxis(np.where(sets[:, :, None, None], motions, 0.0), 0, 2).reshape(n, 3, 6 * s)
     flat = M.reshape(3 * n, 6 * s)
     by_cameras = flat.T @ K
     with_cameras = by_cameras @ reduced.Sinv
@@ -519,8 +519,8 @@ def _bodies_of(reduced: Reduced, moves: _Moves, sets: BoolArray) -> list[_Body]:
     g = (flat.T @ moves.g.ravel()).reshape(s, 6)
     squares = (M * (moves.squares @ M)).sum(axis=(0, 1)).reshape(s, 6)
     values, ranks, beta = gains_of(H, g, squares)
-    move = np.einsum("ncsi,si->ncs", motions, beta)
-    through = np.einsum("sia,si->as", with_cameras.reshape(s, 6, -1), beta)
+    move = np.moveaxis((motions.reshape(s, 3 * n, 6) @ beta[:, :, None]).reshape(s, n, 3), 0, 2)
+    through = np.matmul(beta[:, None], with_cameras.reshape(s, 6, -1))[:, 0].T
     left = moves.g[:, :, None] - (K @ through).reshape(n, 3, s)
     left += moves.alone @ np.where(sets.T[:, None], move, 0.0)
     # of v'Pv, by a point that changes

@@ -163,13 +163,23 @@ def object_fields(points: FloatArray) -> tuple[FloatArray, float]:
 
 
 def rigid_motions(points: FloatArray, body: IntArray | BoolArray) -> FloatArray:
-    """Return the displacements of points by the six motions of a rigid body, (n, 3, 6).
+    """Return the displacements of points by the six motions of a rigid body, (..., n, 3, 6).
 
     The motions are three shifts and three small rotations about its centre, which also move its points by 1.
+
+    Args:
+        points: coordinates, (n, 3); not known (NaN) of points that are in no body only.
+        body: points of each body, (..., n); or the indices of those of one.
     """
-    away = points - points[body].mean(axis=0)
-    turned = -skew(away) / mean_distance(points[body])
-    return np.concatenate([np.tile(np.eye(3), (len(points), 1, 1)), turned], axis=2)
+    members = np.asarray(body if body.dtype == bool else np.isin(np.arange(len(points)), body))
+    known = np.where(members.reshape(-1, len(points)).any(axis=0)[:, None], points, 0.0)
+    count = members.sum(axis=-1)[..., None]
+    away = points - ((members @ known) / count)[..., None, :]
+    square = (np.where(members[..., None], away, 0.0) ** 2).sum(axis=(-2, -1))[..., None]
+    motions = np.zeros((*members.shape, 3, 6))
+    motions[..., :3] = np.eye(3)
+    motions[..., 3:] = -skew(away) / np.sqrt(square / count)[..., None, None]
+    return motions
 
 
 def interior_columns(

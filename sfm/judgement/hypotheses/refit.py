@@ -149,8 +149,9 @@ def _stepped(
     Source: Grippo, Lampariello and Lucidi (1986), SIAM J. Numer. Anal. 23(4) (nonmonotone line search).
     """
     xy, whole = plain.network.image_points.xy, None
+    flat = D.reshape(2 * len(xy), -1)
     for taken in range(1, HALVINGS + 1):
-        points = replace(plain.network.image_points, xy=xy - D @ (beta + step))
+        points = replace(plain.network.image_points, xy=xy - (flat @ (beta + step)).reshape(-1, 2))
         adjusted = readjusted(plain, replace(plain.network, image_points=points), start)
         if adjusted is not None:
             if log_likelihood_of(adjusted) > least - LAST_GAIN:
@@ -195,7 +196,8 @@ def readjusted(plain: Adjustment, network: Network, start: Adjustment) -> Adjust
 
 def _side_by_side(every: Sequence[Alternative], a: Adjustment, columns: Columns) -> FloatArray:
     """Return the columns of alternatives, (k, 2, q)."""
-    return np.concatenate([alternative.columns(a, columns) for alternative in every], axis=2)
+    of_each = [alternative.columns(a, columns) for alternative in every]
+    return of_each[0] if len(of_each) == 1 else np.concatenate(of_each, axis=2)
 
 
 def log_likelihood_of(a: Adjustment, freed: int = 0) -> float:

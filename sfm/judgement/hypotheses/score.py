@@ -77,7 +77,9 @@ class Reduced:
 
     def whiten(self, columns: FloatArray) -> FloatArray:
         """Return the whitened columns of accepted image points, from columns of all (k, 2, q)."""
-        return np.asarray(self.F @ columns[self.used])
+        D = np.empty((len(self.used), 2, columns.shape[2]))
+        _whiten(self.used, self.F, np.ascontiguousarray(columns), D)
+        return D
 
     def project_by_run(self, D: FloatArray, run: IntArray) -> tuple[FloatArray, FloatArray, FloatArray]:
         """Return H (u, f, u, f), g (u, f) and squares (u, f) of whitened columns (k, 2, f).
@@ -275,12 +277,14 @@ def reduce_adjustment(a: Adjustment) -> Reduced:
     used = np.flatnonzero(usable)
     share = network.share[used]
     P = np.linalg.inv(a.image_covariance[used]) * (share / a.sigma0**2)[:, None, None]
-    F = np.swapaxes(np.linalg.cholesky(P), 1, 2)
+    F = np.ascontiguousarray(np.swapaxes(np.linalg.cholesky(P), 1, 2))
     image, point = seen.image[used], seen.point[used]
     interior, prior, slope = _free_interior(a)
-    v, B = np.empty((len(used), 2)), np.empty((len(used), 2, 3))
+    v, B = np.einsum("kab,kb->ka", F, a.residuals[used]), np.empty((len(used), 2, 3))
     A = np.empty((len(used), 2, 6 + interior.shape[2]))
-    _whiten(used, np.ascontiguousarray(F), a.residuals, columns.point, columns.exterior, interior, v, B, A)
+    _whiten(used, F, columns.point, B)
+    _whiten(used, F, columns.exterior, A[:, :, :6])
+    _whiten(used, F, interior, A[:, :, 6:])
     if fixed.any():
         B[np.swapaxes(np.broadcast_to(fixed[point, :, None], (len(used), 3, 2)), 1, 2)] = 0.0
     size = 6 * m + interior.shape[2]
@@ -337,36 +341,20 @@ def _given_points(a: Adjustment) -> tuple[FloatArray, FloatArray, BoolArray]:
 
 
 @compiled
-def _whiten(
-    used: IntArray, F: FloatArray, residuals: FloatArray, by_point: FloatArray, by_pose: FloatArray,
-    by_interior: FloatArray, v: FloatArray, B: FloatArray, A: FloatArray,
-) -> None:  # fmt: skip
-    """Fill the whitened residuals v and derivatives B and A, see `Reduced`, of the accepted image points.
+def _whiten(used: IntArray, F: FloatArray, columns: FloatArray, whitened: FloatArray) -> None:
+    """Fill in the whitened columns of the accepted image points.
 
     Args:
         used: accepted image points, (k,).
         F: upper triangular whitening of each of them, (k, 2, 2).
-        residuals: residuals of all image points, (all, 2).
-        by_point: derivatives by object points, (all, 2, 3).
-        by_pose: derivatives by photographs, (all, 2, 6).
-        by_interior: derivatives by free interior parameters, (all, 2, i).
-        v: to fill.
-        B: to fill.
-        A: to fill.
+        columns: columns of all image points, px, (all, 2, q).
+        whitened: to fill, (k, 2, q).
     """
     for k in range(len(used)):
-        o, a, b, c = used[k], F[k, 0, 0], F[k, 0, 1], F[k, 1, 1]
-        v[k, 0] = a * residuals[o, 0] + b * residuals[o, 1]
-        v[k, 1] = c * residuals[o, 1]
-        for p in range(3):
-            B[k, 0, p] = a * by_point[o, 0, p] + b * by_point[o, 1, p]
-            B[k, 1, p] = c * by_point[o, 1, p]
-        for p in range(6):
-            A[k, 0, p] = a * by_pose[o, 0, p] + b * by_pose[o, 1, p]
-            A[k, 1, p] = c * by_pose[o, 1, p]
-        for p in range(by_interior.shape[2]):
-            A[k, 0, 6 + p] = a * by_interior[o, 0, p] + b * by_interior[o, 1, p]
-            A[k, 1, 6 + p] = c * by_interior[o, 1, p]
+        x, y, a, b, c = columns[used[k], 0], columns[used[k], 1], F[k, 0, 0], F[k, 0, 1], F[k, 1, 1]
+        for j in range(len(x)):
+            whitened[k, 0, j] = a * x[j] + b * y[j]
+            whitened[k, 1, j] = c * y[j]
 
 
 @compiled

@@ -83,7 +83,8 @@ def find_optimum(
         bends = np.asarray(layout.active & (weight == 0) & (length > FAR_OFF * np.nanmedian(length)))
         out = bends if reject == "tukey" else None  # even bounded, their influence may hide a good one
         robust, factor = _reweight(run, optimum, weight, huber_weights, out=out)
-        if _distorted_photographs(run, state, robust.state).any():
+        ends = (residuals(layout.observations, at) for at in (state, robust.state))
+        if _distorted_photographs(run, *ends).any():
             robust, factor = optimum, weight
             if reject == "huber":
                 robust, factor = _reweight(run, optimum, weight, huber_weights, out=bends)
@@ -230,8 +231,7 @@ def _undistorted_optimum(
     """
     layout = run.problem.layout
 
-    def spread(at: State) -> float:
-        v = residuals(layout.observations, at)
+    def spread(v: FloatArray) -> float:
         return robust_scale(layout.observations, v, layout.active & np.isfinite(v).all(axis=1), freedom=1.0)
 
     try:
@@ -241,13 +241,14 @@ def _undistorted_optimum(
         if begun is None:
             raise
         optimum, plain = replace(begun, converged=False), weight
-    limit, first = spread(optimum.state), max(spread(state), least_sigma(layout.observations))
+    before, after = residuals(layout.observations, state), residuals(layout.observations, optimum.state)
+    limit, first = spread(after), max(spread(before), least_sigma(layout.observations))
 
-    def sound(optimum: Optimum) -> bool:
-        fits = spread(optimum.state) <= MIN_BENT_RATIO * first
-        return optimum.converged and fits and not _distorted_photographs(run, state, optimum.state).any()
+    def sound(optimum: Optimum, v: FloatArray) -> bool:
+        fits = spread(v) <= MIN_BENT_RATIO * first
+        return optimum.converged and fits and not _distorted_photographs(run, before, v).any()
 
-    if sound(optimum):
+    if sound(optimum, after):
         return optimum, plain
     begun = begun or optimum_at(run.problem, state, weight)
     if begun is None:
@@ -263,34 +264,36 @@ def _undistorted_optimum(
             robust = run.again(robust, factor)
         except GeometryError:
             continue
-        last = estimators[0] is huber_weights
-        if sound(robust) or (last and robust.converged and spread(robust.state) < limit):
+        last, after = estimators[0] is huber_weights, residuals(layout.observations, robust.state)
+        if sound(robust, after) or (last and robust.converged and spread(after) < limit):
             return robust, factor
     return optimum, plain
 
 
-def _distorted_photographs(run: Run, start: State, end: State) -> BoolArray:
+def _distorted_photographs(run: Run, start: FloatArray, end: FloatArray) -> BoolArray:
     """Return the photographs with most image points fitting far worse at the end than at the start, (m,).
+
+    The residuals of all image points are px, (k, 2).
 
     They must fit worse than before and worse than the others. An error in one of six image points distorts
     its photograph only, which the median over all photographs does not show.
     """
     observations, active = run.problem.layout.observations, run.problem.layout.active
-    before, after = (_median_lengths(observations, at, active) for at in (start, end))
+    before, after = (_median_lengths(observations, v, active) for v in (start, end))
     before = np.maximum(before, least_sigma(observations))
     return np.asarray(
         after > np.maximum(MIN_BENT_RATIO * before, MIN_BENT_RATIO_OF_ONE * np.nanmedian(after))
     )
 
 
-def _median_lengths(observations: Observations, state: State, active: BoolArray) -> FloatArray:
+def _median_lengths(observations: Observations, v: FloatArray, active: BoolArray) -> FloatArray:
     """Return the median length of the residuals of each photograph, in standard deviations, (m,).
 
     For an even number it is the upper median, because three of six image points fit any resection.
     """
-    length = residual_lengths(observations, residuals(observations, state))
+    length = residual_lengths(observations, v)
     length = np.where(active & np.isfinite(length), length, np.inf)
-    out = np.full(len(state.position), np.nan)
+    out = np.full(len(observations.camera), np.nan)
     order = np.lexsort((length, observations.image))
     count = np.bincount(observations.image, minlength=len(out))
     first = np.cumsum(count) - count
@@ -316,7 +319,7 @@ def _snoop_all(run: Run, optimum: Optimum, weight: FloatArray, alpha: float) -> 
         if redundancy < 2:
             break
         v = residuals(layout.observations, optimum.state)
-        Q = cofactors(optimum, layout)
+        Q = cofactors(optimum, layout, datum=False)
         complement = hat_complement(optimum, layout, Q, weight)
         if run.problem.observed:
             vPv, of_image_points = sum_of_squares(layout.observations, v, complement, weight > 0)

@@ -307,6 +307,8 @@ def further_rays(
         least: standardised residual above which image points of each photograph may be rejected, shape (m,).
     """
     further = np.zeros(len(used), dtype=bool)
+    if not out.any():
+        return further
     count = np.bincount(observations.image[used], minlength=len(least))
     F, B = whitening_matrix(observations.whitening), _by_points(observations, state, v, limiting)
     B *= np.sqrt(observations.share)[:, None, None]
