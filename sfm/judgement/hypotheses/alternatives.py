@@ -508,21 +508,21 @@ def _bodies_from(reduced: Reduced, moves: _Moves, starts: list[BoolArray]) -> di
 def _bodies_of(reduced: Reduced, moves: _Moves, sets: BoolArray) -> list[_Body]:
     """Return the body of each set of points, (s, n); one product serves all of them."""
     X, K = reduced.adjustment.estimate.points[moves.points], moves.K.reshape(-1, len(reduced.t))
-    s, n = sets.shape
-    motions = rigid_motions(X, sets)
-    M = np.moveaxis(np.where(sets[:, :, None, None], motions, 0.0), 0, 2).reshape(n, 3, 6 * s)
-    flat = M.reshape(3 * n, 6 * s)
-    by_cameras = flat.T @ K
+    (s, n), some = sets.shape, np.flatnonzero(sets.any(axis=0))
+    motions, alone = rigid_motions(X, sets), moves.alone[some]
+    M = np.moveaxis(np.where(sets[:, some, None, None], motions[:, some], 0.0), 0, 2)
+    flat, M = M.reshape(-1, 6 * s), M.reshape(len(some), 3, 6 * s)
+    by_cameras = flat.T @ moves.K[some].reshape(len(flat), -1)
     with_cameras = by_cameras @ reduced.Sinv
-    H = flat.T @ (moves.alone @ M).reshape(3 * n, 6 * s) - with_cameras @ by_cameras.T
+    H = flat.T @ (alone @ M).reshape(len(flat), 6 * s) - with_cameras @ by_cameras.T
     H = np.einsum("iaib->iab", H.reshape(s, 6, s, 6))
-    g = (flat.T @ moves.g.ravel()).reshape(s, 6)
-    squares = (M * (moves.squares @ M)).sum(axis=(0, 1)).reshape(s, 6)
+    g = (flat.T @ moves.g[some].ravel()).reshape(s, 6)
+    squares = (M * (moves.squares[some] @ M)).sum(axis=(0, 1)).reshape(s, 6)
     values, ranks, beta = gains_of(H, g, squares)
     move = np.moveaxis((motions.reshape(s, 3 * n, 6) @ beta[:, :, None]).reshape(s, n, 3), 0, 2)
     through = np.matmul(beta[:, None], with_cameras.reshape(s, 6, -1))[:, 0].T
     left = moves.g[:, :, None] - (K @ through).reshape(n, 3, s)
-    left += moves.alone @ np.where(sets.T[:, None], move, 0.0)
+    left[some] += alone @ np.where(sets.T[some, None], move[some], 0.0)
     # of v'Pv, by a point that changes
     loss = (move * (moves.blocks @ move)).sum(axis=1)
     along = 2 * (left * move).sum(axis=1)
