@@ -172,7 +172,8 @@ def rigid_motions(points: FloatArray, body: IntArray | BoolArray) -> FloatArray:
         body: points of each body, (..., n); or the indices of those of one.
     """
     members = np.asarray(body if body.dtype == bool else np.isin(np.arange(len(points)), body))
-    known = np.where(members.reshape(-1, len(points)).any(axis=0)[:, None], points, 0.0)
+    used = np.asarray(members.reshape(-1, len(points)).any(axis=0))
+    known = np.where(used[:, None], points, 0.0)
     count = members.sum(axis=-1)[..., None]
     away = points - ((members @ known) / count)[..., None, :]
     square = (np.where(members[..., None], away, 0.0) ** 2).sum(axis=(-2, -1))[..., None]
