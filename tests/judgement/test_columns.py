@@ -70,6 +70,15 @@ def test_motions_of_a_body_move_its_points_by_one() -> None:
     np.testing.assert_allclose(motions[:, :, 5], [[0, 1, 0], [0, -1, 0], [-1, 0, 0], [-4, 3, 0], [1, 0, 0]])
 
 
+def test_motions_of_several_bodies_are_those_of_each() -> None:
+    """A point without coordinates is in none of them."""
+    points = seed_of("several bodies").standard_normal((9, 3))
+    points[8] = np.nan
+    bodies = np.array([np.isin(np.arange(9), members) for members in ((0, 1, 2), (2, 4, 5, 7))])
+    for body, motions in zip(bodies, rigid_motions(points, bodies), strict=True):
+        np.testing.assert_allclose(motions, rigid_motions(points, body), rtol=1e-12, atol=1e-12)
+
+
 def test_columns_are_differences(a: Adjustment) -> None:
     found, estimate, h = columns_of(a), a.estimate, 1e-6
     assert found.usable.all()

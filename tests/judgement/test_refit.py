@@ -171,6 +171,19 @@ def test_an_adjustment_that_is_not_checked_is_none(a: Adjustment, monkeypatch: p
     assert readjusted(plain, a.network, a) is None
 
 
+@pytest.mark.parametrize("design_effect", [1.0, 2.5])
+def test_a_trial_has_the_redundancy_of_an_adjustment_with_covariance(
+    a: Adjustment, design_effect: float
+) -> None:
+    """Errors in common lower it by redundancy numbers, for which the covariance is needed; else it is not."""
+    network = replace(a.network, sources=(replace(a.network.sources[0], design_effect=design_effect),))
+    plain = adjust(network, a.estimate, datum=Datum("free"))
+    trial = readjusted(plain, network, plain)
+    assert trial is not None and trial.redundancy == plain.redundancy
+    assert trial.sigma0 == pytest.approx(plain.sigma0) and (trial.rejected == plain.rejected).all()
+    assert np.isfinite(trial.covariance.points).all() == (design_effect > 1)
+
+
 def test_another_network_is_adjusted_as_the_plain_one(a: Adjustment, monkeypatch: pytest.MonkeyPatch) -> None:
     given: dict[str, Any] = {}
     monkeypatch.setattr(refitting, "adjust", lambda *_, **options: given.update(options) or a)

@@ -228,7 +228,14 @@ def test_earlier_causes_stay_while_the_others_do_not_explain_them(
 
     def without(losses: dict[float, float]) -> Callable[..., Refit]:
         def alone(
-            plain: Adjustment, one: Alternative, start: Adjustment, others: Any, *, least: float, asked: float
+            plain: Adjustment,
+            one: Alternative,
+            start: Adjustment,
+            others: Any,
+            *,
+            least: float,
+            asked: float,
+            **_: object,
         ) -> Refit:
             assert least == -np.inf  # without a cause, likelihood is lost
             assert asked == pytest.approx(-limit)  # the rounds end where it cannot rise to that

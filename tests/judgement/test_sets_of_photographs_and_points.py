@@ -247,6 +247,20 @@ def test_two_points_are_no_body() -> None:
     assert found and all(one.points.tolist() == [3, 5, 8] for one in found)
 
 
+def test_sets_that_are_tried_together_have_the_motions_of_each() -> None:
+    """The gain, what is left of all points, and the points that fit the motion better than none."""
+    reduced, moves = moves_of(np.where(np.arange(20)[:, None] < 6, 12.0, 0.0), "tried together")
+    sets = np.array([np.isin(np.arange(20), members) for members in (range(6), (1, 2, 9, 12), range(3, 9))])
+    together = alternatives._bodies_of(reduced, moves, sets)
+    for body, members in zip(together, sets, strict=True):
+        (alone,) = alternatives._bodies_of(reduced, moves, members[None])
+        assert body.gain.value == pytest.approx(alone.gain.value) and body.gain.rank == alone.gain.rank == 6
+        np.testing.assert_allclose(body.gain.beta, alone.gain.beta, atol=1e-9)
+        np.testing.assert_allclose(body.left, alone.left, atol=1e-9)
+        assert (body.fitting == alone.fitting).all() and (body.members == members).all()
+    assert together[0].gain.value > max(body.gain.value for body in together[1:])
+
+
 def test_a_body_that_several_points_lead_to_is_told_once() -> None:
     d = np.full((30, 3), 40.0)
     d[:16] = 0.0
