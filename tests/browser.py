@@ -16,7 +16,7 @@ ARGUMENTS = [
     "--use-angle=swiftshader",
     "--enable-unsafe-swiftshader",
     "--disable-gpu-sandbox",
-    # The processor puts the page together itself: by the card that swiftshader computes it takes twice as long.
+    # the processor puts pages together itself: by the card that swiftshader computes it takes twice as long
     "--disable-gpu-compositing",
     "--disable-gpu-rasterization",
 ]

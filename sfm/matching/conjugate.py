@@ -15,7 +15,10 @@ shape, so the ratio of the spectra of two photographs of one object is the ratio
 
 from __future__ import annotations
 
+import weakref
+from collections.abc import Callable
 from dataclasses import dataclass, replace
+from functools import cache
 from itertools import combinations
 
 import cv2
@@ -40,7 +43,7 @@ from sfm.matching.correlation import (
     match_ncc_warped,
 )
 from sfm.matching.radiometry import grey_of, grey_of_8_bit, shrink_photograph
-from sfm.matching.tracks.features import match_features, sift_features
+from sfm.matching.tracks.features import Features, match_features, sift_features
 from sfm.model.arguments import checked_arguments
 from sfm.model.conventions import MAD_TO_SIGMA, AnyArray, FloatArray, IntArray
 from sfm.model.display import in_words
@@ -80,6 +83,36 @@ MIN_REACH_PX = 4  # of that search
 TOO_LITTLE_TEXTURE = (in_words(NccFlag, NccFlag.AMBIGUOUS), in_words(LsmFlag, LsmFlag.FLAT_TEXTURE))
 
 
+class KeyPoints:
+    """Key points of photographs, extracted once although each photograph is matched with several others.
+
+    They are kept as long as the photograph is.
+    """
+
+    def __init__(self) -> None:
+        """Start empty."""
+        self._kept: dict[int, tuple[weakref.ref[AnyArray], dict[tuple[int, ...], Features]]] = {}
+
+    def of(self, photograph: AnyArray, part: tuple[int, int, int, int], max_features: int) -> Features:
+        """Return the key points of a part of a photograph, in px of that part.
+
+        Args:
+            photograph: (H, W), 8 or 16 bit or float, grey or colour; not to be changed afterwards.
+            part: first column and row, and the column and row after the last.
+            max_features: largest number of key points; the strongest are kept.
+        """
+        number = id(photograph)
+        kept = self._kept.get(number)
+        if kept is None or kept[0]() is not photograph:
+            kept = weakref.ref(photograph, lambda _: self._kept.pop(number, None)), {}
+            self._kept[number] = kept
+        key = (*part, max_features)
+        if key not in kept[1]:
+            left, top, right, bottom = part
+            kept[1][key] = sift_features(photograph[top:bottom, left:right], max_features=max_features)
+        return kept[1][key]
+
+
 @checked_arguments(xy_left="k 2", xy_right="k 2")
 def match_points(
     left: AnyArray,
@@ -88,6 +121,7 @@ def match_points(
     settings: MatchSettings = MatchSettings(),
     *,
     xy_right: FloatArray | None = None,
+    key_points: KeyPoints | None = None,
 ) -> ConjugatePoints:
     """Find points of the left photograph in the right one.
 
@@ -107,6 +141,7 @@ def match_points(
         settings: method, sizes of template and search window, and limits of a match.
         xy_right: centres of the search windows, px, (k, 2); by default the positions in the left photograph.
             If they are given, positions predicted by key points must lie within the windows.
+        key_points: those of both photographs, shared by the calls that match them with others.
 
     Returns:
         One result per point.
@@ -126,6 +161,7 @@ def match_points(
     back = None if settings.back_px is None else settings.back_px / seen.shrink
     wide = settings.wide and side >= MIN_TEMPLATE_PX
     by = replace(settings, search_px=side + 2 * reach, back_px=back, wide=wide)
+    shared = KeyPoints() if key_points is None else key_points
     matched = _match_by_size(
         seen.left,
         seen.right,
@@ -133,6 +169,7 @@ def match_points(
         seen.small(b),
         by,
         given=xy_right is not None,
+        key_points=shared,
     )
     right_xy = np.where(matched.good[:, None], seen.full(matched.right), np.nan)
     covariance = np.where(matched.good[:, None, None], seen.shrink**2 * matched.covariance, np.nan)
@@ -142,7 +179,14 @@ def match_points(
 
 
 def _match_by_size(
-    left: AnyArray, right: AnyArray, a: FloatArray, b: FloatArray, by: MatchSettings, *, given: bool
+    left: AnyArray,
+    right: AnyArray,
+    a: FloatArray,
+    b: FloatArray,
+    by: MatchSettings,
+    *,
+    given: bool,
+    key_points: KeyPoints,
 ) -> ConjugatePoints:
     """Match points with templates of the requested size, and with larger ones where these show too little.
 
@@ -153,18 +197,25 @@ def _match_by_size(
         b: centres of the search windows, px, (k, 2).
         by: matching settings.
         given: whether the caller gave the centres; if not, they are the positions in the left photograph.
+        key_points: those of the photographs.
     """
     if not by.wide:
         return flag_unconfirmed(left, right, match_upright(left, right, a, b, by), by)
-    maps = local_affinities(left, right, a)
-    if given:
-        maps.xy[~(np.abs(maps.xy - b) <= by.search_px // 2).all(axis=1)] = np.nan
-    matched = _match(left, right, a, b, by, maps, given=given)
+
+    @cache
+    def predicted() -> LocalAffinities:
+        """Return the maps of the key points, which take long and are not needed if all points are found."""
+        maps = local_affinities(left, right, a, key_points=key_points)
+        if given:
+            maps.xy[~(np.abs(maps.xy - b) <= by.search_px // 2).all(axis=1)] = np.nan
+        return maps
+
+    matched = _match(left, right, a, b, by, predicted, given=given)
     few = np.flatnonzero([why in TOO_LITTLE_TEXTURE for why in matched.reason])
     if len(few):
         more = by.template_px - 1
         larger = replace(by, template_px=by.template_px + more, search_px=by.search_px + more)
-        again = _match(left, right, a[few], b[few], larger, maps.rows(few), given=given)
+        again = _match(left, right, a[few], b[few], larger, lambda: predicted().rows(few), given=given)
         matched = matched.with_rows(few[again.good], again.rows(again.good))
     return matched
 
@@ -175,7 +226,7 @@ def _match(
     a: FloatArray,
     b: FloatArray,
     by: MatchSettings,
-    maps: LocalAffinities,
+    predicted: Callable[[], LocalAffinities],
     *,
     given: bool,
 ) -> ConjugatePoints:
@@ -187,11 +238,14 @@ def _match(
         a: points in the left photograph, px, (k, 2).
         b: centres of the search windows, px, (k, 2).
         by: matching settings.
-        maps: positions and shapes that the key points predict.
+        predicted: returns the positions and shapes that the key points predict.
         given: whether the caller gave the centres; if not, they are the positions in the left photograph.
     """
     matched = flag_unconfirmed(left, right, match_upright(left, right, a, b, by), by)
     lost = np.array([bool(why) and "left photograph" not in why for why in matched.reason], dtype=bool)
+    if not lost.any():
+        return matched
+    maps = predicted()
     led = np.isfinite(maps.xy).all(axis=1)
     rows = np.flatnonzero(lost & led)
     if len(rows):
@@ -303,7 +357,13 @@ class LocalAffinities:
 
 
 def local_affinities(
-    left: AnyArray, right: AnyArray, xy: FloatArray, *, max_features: int = MAX_FEATURES, seed: int = 0
+    left: AnyArray,
+    right: AnyArray,
+    xy: FloatArray,
+    *,
+    key_points: KeyPoints,
+    max_features: int = MAX_FEATURES,
+    seed: int = 0,
 ) -> LocalAffinities:
     """Return the affine map around each point on which the key points near it agree.
 
@@ -311,6 +371,7 @@ def local_affinities(
         left: photograph, (H, W), 8 or 16 bit or float, grey or colour.
         right: the other photograph.
         xy: points in the left photograph, px, (k, 2).
+        key_points: those of the photographs.
         max_features: largest number of key points per photograph; the strongest are kept.
         seed: seed of the random samples for the epipolar geometry.
 
@@ -321,9 +382,10 @@ def local_affinities(
     if not len(at):
         return affinities_around(at, at, at)
     low = np.maximum(np.floor(at.min(axis=0) - MARGIN_PX), 0).astype(int)  # only the part near points matters
-    high = np.ceil(at.max(axis=0) + MARGIN_PX).astype(int)
-    part = left[low[1] : high[1], low[0] : high[0]]
-    a, b = (sift_features(photograph, max_features=max_features) for photograph in (part, right))
+    high = np.minimum(np.ceil(at.max(axis=0) + MARGIN_PX).astype(int), left.shape[1::-1])
+    x, y = low.tolist()
+    a = key_points.of(left, (x, y, *high.tolist()), max_features)
+    b = key_points.of(right, (0, 0, right.shape[1], right.shape[0]), max_features)
     pairs = match_features(a, b, seed=seed)
     return affinities_around(a.xy[pairs[:, 0]] + low, b.xy[pairs[:, 1]], at)
 

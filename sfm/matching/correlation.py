@@ -471,13 +471,15 @@ def _inside_right(
 ) -> BoolArray:
     """Return at which positions in the window the whole template is inside the right photograph, (n, n)."""
     at = np.arange(-reach, reach + 1.0)
-    x, y = at[None, :] - fraction[0], at[:, None] - fraction[1]
     inside = np.ones((len(at), len(at)), dtype=bool)
-    for row in (-half, half):
-        for col in (-half, half):
-            u = A[0, 0] * (x + col) + A[0, 1] * (y + row) + b[0]
-            v = A[1, 0] * (x + col) + A[1, 1] * (y + row) + b[1]
-            inside &= (u >= 0) & (v >= 0) & (u <= shape[1] - 1) & (v <= shape[0] - 1)
+    for axis in range(2):
+        along_x = A[axis, 0] * (at - fraction[0]) + b[axis]
+        along_y = A[axis, 1] * (at - fraction[1])
+        margin = half * (abs(A[axis, 0]) + abs(A[axis, 1]))  # of the template's corners
+        first, last = margin, shape[1 - axis] - 1 - margin
+        if along_x.min() + along_y.min() < first or along_x.max() + along_y.max() > last:
+            middle = along_x + along_y[:, None]
+            inside &= (middle >= first) & (middle <= last)
     return inside
 
 

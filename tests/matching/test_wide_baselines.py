@@ -62,7 +62,9 @@ def test_without_key_points_templates_are_turned(
     monkeypatch: pytest.MonkeyPatch, angle_deg: float, scale: float
 ) -> None:
     none = np.zeros((0, 2))
-    monkeypatch.setattr(conjugate, "local_affinities", lambda _l, _r, at: affinities_around(none, none, at))
+    monkeypatch.setattr(
+        conjugate, "local_affinities", lambda _l, _r, at, **_: affinities_around(none, none, at)
+    )
     left, right, truth = _turned(angle_deg, scale)
     some, start = POINTS[::3], truth[::3] + np.array([6.0, -5.0])
     assert (

@@ -28,7 +28,7 @@ import numpy as np
 
 from sfm.files.open_folders import path_inside
 from sfm.judgement.survey_result import LeftOutPoint
-from sfm.matching.conjugate import match_points
+from sfm.matching.conjugate import KeyPoints, match_points
 from sfm.matching.lsm.coverage import project_points
 from sfm.matching.lsm.surface_planes import squares_over_covariance
 from sfm.matching.radiometry import GreyPhotographs, grey_of
@@ -242,7 +242,7 @@ def _match_all(
     window_px = survey.texture.window_px
     scenes: dict[str, tuple[TemplateScene, int] | None] = {}
     templates: defaultdict[str, list[PointSettings]] = defaultdict(list)
-    named: set[str] = set()
+    named, key_points = set[str](), KeyPoints()
     images, is_oriented = scene.network.images, scene.estimate.oriented
     for mark in survey.marks:
         if mark.name in named:
@@ -253,7 +253,7 @@ def _match_all(
                 path = path_inside(
                     survey.folder, mark.image, survey.source, allow_outside=survey.allow_outside
                 )
-                with_earlier = _with_earlier(scene, grey_of(read_photograph(path)))
+                with_earlier = _with_earlier(scene, grey_of(read_photograph(path)), key_points)
                 if with_earlier is not None:
                     scenes[mark.image] = with_earlier, with_earlier.earlier
             elif mark.image in images and is_oriented[images.index(mark.image)]:
@@ -272,10 +272,11 @@ def _match_all(
     return TemplateRays(ImagePoints.joined(parts), np.concatenate(alike))
 
 
-def _with_earlier(scene: TemplateScene, photograph: AnyArray) -> TemplateScene | None:
+def _with_earlier(scene: TemplateScene, photograph: AnyArray, key_points: KeyPoints) -> TemplateScene | None:
     """Return the photographs and one of an earlier epoch, oriented on its points; None if it cannot be.
 
-    It is assumed to be of the first camera with photographs of its size.
+    It is assumed to be of the first camera with photographs of its size. The key points are those of all
+    photographs, for the next one of an earlier epoch.
     """
     network, estimate, seen = scene.network, scene.estimate, scene.seen
     of_size = [a for a, lens in enumerate(estimate.cameras) if lens.size_px == photograph.shape[::-1]]
@@ -288,7 +289,7 @@ def _with_earlier(scene: TemplateScene, photograph: AnyArray) -> TemplateScene |
         shown = seen.select(seen.image == i)
         if len(shown):
             shown = shown.select(np.arange(0, len(shown), -(-len(shown) // MOST_RESECTED)))
-            matches = match_points(scene.grey[i].pixels, photograph, shown.xy)
+            matches = match_points(scene.grey[i].pixels, photograph, shown.xy, key_points=key_points)
             there = replace(shown, image=np.full(len(shown), m), xy=matches.right)
             parts.append(there.select(matches.good))
     matched = ImagePoints.joined(parts)
