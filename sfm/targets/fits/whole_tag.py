@@ -24,7 +24,8 @@ from dataclasses import dataclass
 import numpy as np
 from scipy.special import ndtr
 
-from sfm.model.conventions import AnyArray, BoolArray, FloatArray
+from sfm.model.conventions import AnyArray, BoolArray, FloatArray, IntArray
+from sfm.runtime.compiling import kernel
 from sfm.targets.fits.corner import (
     BACKGROUND,
     BLUR,
@@ -64,6 +65,7 @@ STEPS, LAST_STEP_PX = 200, 1e-3
 # over the nodes of Gauss and Hermite (Abramowitz and Stegun 1964, table 25.10, n = 5, for a unit variance).
 NODES = (-2.85697001, -1.35562618, 0.0, 1.35562618, 2.85697001)
 WEIGHTS = (0.01125741, 0.22207592, 0.53333333, 0.22207592, 0.01125741)
+FAR = 8.3  # standard deviations of the blur beyond which Phi is 0 or 1 to the last digit
 _H, _B, _A, _S = slice(0, 8), 8, 9, 10
 
 
@@ -260,29 +262,77 @@ def _derivatives(theta: FloatArray, at: FloatArray, place: FloatArray) -> tuple[
 
 def _model(theta: FloatArray, P: FloatArray, black: BoolArray) -> tuple[FloatArray, FloatArray]:
     """Return the part of black at scaled pixels, (n,), and its derivatives by homography and blur, (n, 9)."""
-    modules = len(black)
     uv, w, along, rest = _in_modules(theta, P)
-    c = black.astype(float)  # rows are v, columns u
-    share, d_u, d_v, d_s = np.zeros((4, len(P)))
-    for node, weight in zip(NODES, WEIGHTS, strict=True):
-        t = ((uv + node * along)[:, :, None] - np.arange(modules + 1)) / rest[:, :, None]
-        phi, density = ndtr(t), np.exp(-0.5 * t**2) / math.sqrt(2 * math.pi)
-        W = weight * (phi[:, :, :-1] - phi[:, :, 1:])
-        by_uv = (density[:, :, :-1] - density[:, :, 1:]) / rest[:, :, None]
-        by_ln_s = -(density * t)[:, :, :-1] + (density * t)[:, :, 1:]
-        along_v, along_u = W[:, 1] @ c, W[:, 0] @ c.T
-        share += (along_v * W[:, 0]).sum(axis=1) / weight
-        by_u, by_v = (along_v * by_uv[:, 0]).sum(axis=1), (along_u * by_uv[:, 1]).sum(axis=1)
-        d_u += by_u
-        d_v += by_v
-        d_s += (along_v * by_ln_s[:, 0]).sum(axis=1) + (along_u * by_ln_s[:, 1]).sum(axis=1)
-        d_s += node * (by_u * along[:, 0] + by_v * along[:, 1])
-    d_s /= theta[_S]
+    share, by_uv, d_s = np.zeros(len(P)), np.zeros((len(P), 2)), np.zeros(len(P))
+    parts, span = np.empty((4, 2, len(black))), np.empty((2, 2), dtype=np.int64)
+    _sum_modules(uv, along, rest, black.astype(float), parts, span, share, by_uv, d_s)
+    d_u, d_v = by_uv.T
     D = np.empty((len(P), 9))
     D[:, :3], D[:, 3:6] = d_u[:, None] * P / w[:, None], d_v[:, None] * P / w[:, None]
     D[:, 6:8] = -(d_u * uv[:, 0] + d_v * uv[:, 1])[:, None] * P[:, :2] / w[:, None]
-    D[:, 8] = d_s
+    D[:, 8] = d_s / theta[_S]
     return share, D
+
+
+@kernel
+def _sum_modules(
+    uv: FloatArray,
+    along: FloatArray,
+    rest: FloatArray,
+    black: FloatArray,
+    parts: FloatArray,
+    span: IntArray,
+    share: FloatArray,
+    by_uv: FloatArray,
+    by_ln_s: FloatArray,
+) -> None:
+    """Sum the modules that each pixel sees, over the nodes of the blur along one direction.
+
+    Args:
+        uv: positions of the pixels, modules, (n, 2).
+        along: blur along one direction, (n, 2).
+        rest: blur of u and v beside it, (n, 2).
+        black: 1 for black modules, rows are v, (m, m).
+        parts: is overwritten, (4, 2, m).
+        span: is overwritten, (2, 2).
+        share: receives the part of black, added to it, (n,).
+        by_uv: receives its derivatives by the position, (n, 2).
+        by_ln_s: receives its derivative by the logarithm of the blur, (n,).
+    """
+    m = len(black)
+    W, by_place, by_blur, seen = parts[0], parts[1], parts[2], parts[3]
+    for n in range(len(uv)):
+        for k in range(len(NODES)):
+            node, weight = NODES[k], WEIGHTS[k]
+            for axis in range(2):
+                place, blur = uv[n, axis] + node * along[n, axis], rest[n, axis]
+                span[axis, 0] = min(max(math.floor(place - FAR * blur), 0), m)
+                span[axis, 1] = min(max(math.ceil(place + FAR * blur), 0), m)
+                phi = density = at_edge = 0.0
+                for e in range(span[axis, 0], span[axis, 1] + 1):
+                    t = (place - e) / blur
+                    phi_before, density_before, before = phi, density, at_edge
+                    phi, density = 0.5 * math.erfc(-t * math.sqrt(0.5)), math.exp(-0.5 * t * t)
+                    at_edge = density * t
+                    if e > span[axis, 0]:
+                        W[axis, e - 1] = phi_before - phi
+                        by_place[axis, e - 1] = density_before - density
+                        by_blur[axis, e - 1] = at_edge - before
+                        seen[axis, e - 1] = 0.0
+            for row in range(span[1, 0], span[1, 1]):
+                for column in range(span[0, 0], span[0, 1]):
+                    seen[0, column] += black[row, column] * W[1, row]
+                    seen[1, row] += black[row, column] * W[0, column]
+            for i in range(span[0, 0], span[0, 1]):
+                share[n] += weight * seen[0, i] * W[0, i]
+            for axis in range(2):
+                of_place = of_blur = 0.0
+                for i in range(span[axis, 0], span[axis, 1]):
+                    of_place += seen[axis, i] * by_place[axis, i]
+                    of_blur += seen[axis, i] * by_blur[axis, i]
+                of_place *= weight / math.sqrt(2 * math.pi) / rest[n, axis]
+                by_uv[n, axis] += of_place
+                by_ln_s[n] += weight / math.sqrt(2 * math.pi) * of_blur + node * of_place * along[n, axis]
 
 
 def _in_modules(theta: FloatArray, P: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray, FloatArray]:
