@@ -18,6 +18,7 @@ os.environ.setdefault("OMP_NUM_THREADS", "1")
 
 import matplotlib
 import pytest
+from matplotlib.backends.backend_agg import FigureCanvasAgg
 
 from tests.places import ROOT, SHARED
 
@@ -116,8 +117,12 @@ def plots() -> None:
 
 @pytest.fixture(autouse=True)
 def no_plots(request: pytest.FixtureRequest, monkeypatch: pytest.MonkeyPatch) -> None:
-    """Spare the plots, which take as long as a small survey, and the process that draws them."""
+    """Spare the plots, which take as long as a small survey, and the process that draws them.
+
+    The figures of pages that draw their own are made, and remain empty.
+    """
     if "plots" not in request.fixturenames:
+        monkeypatch.setattr(FigureCanvasAgg, "draw", FigureCanvasAgg.get_renderer)
         monkeypatch.setattr("sfm.report.figures.plot_process.plot_process", lambda _: nullcontext())
         monkeypatch.setattr("sfm.report.output.draw_plots", lambda _: [])
 

@@ -53,6 +53,7 @@ def test_the_known_region_has_image_points(sound: Calibration) -> None:
     assert not inside[(xy == 0).all(axis=1)].any() or (camera.xy < 30).all(axis=1).any()
 
 
+@pytest.mark.usefixtures("plots")
 def test_the_page_answers_four_questions_and_has_the_same_for_programs(sound: Calibration) -> None:
     declared = page(sound, folder="out/board")
     titles = [section.title for section in declared.sections]
