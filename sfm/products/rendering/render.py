@@ -89,7 +89,7 @@ def render_photograph(
     if blur > 0:
         reach = 2 * math.ceil(5 * blur) + 1
         cv2.GaussianBlur(fine, (reach, reach), blur, dst=fine, borderType=cv2.BORDER_REPLICATE)
-    light = fine.reshape(height, n, width, n).mean(axis=(1, 3), dtype=np.float32)
+    light = np.asarray(cv2.resize(fine, (width, height), interpolation=cv2.INTER_AREA))  # means of cells
     y, x = np.ogrid[:height, :width]
     corner = (width / 2) ** 2 + (height / 2) ** 2
     r2 = ((x - (width - 1) / 2) ** 2 + (y - (height - 1) / 2) ** 2) / corner

@@ -5,6 +5,7 @@ from __future__ import annotations
 import threading
 import time
 from collections.abc import Iterator
+from functools import cache
 from pathlib import Path
 from typing import Any
 
@@ -41,9 +42,19 @@ free = []
 
 def write_board(folder: Path, count: int) -> FloatArray:
     """Write photographs of dots on a textured ground, and return their places, px, (m, n, 2)."""
+    pictures, xy = pictures_of_board(count)
+    for i, picture in enumerate(pictures):
+        cv2.imwrite(str(folder / f"i{i}.png"), picture)
+    return xy.copy()
+
+
+@cache
+def pictures_of_board(count: int) -> tuple[tuple[AnyArray, ...], FloatArray]:
+    """Return the photographs and the places of the dots."""
     rng = np.random.default_rng(4)
     places, rotations = stations(rng, count, around=1.4)
     xy = (seen_points(places, rotations, BOARD) + 0.5) / SHRINK - 0.5
+    pictures = []
     for i in range(count):
         picture = np.full((4 * 500, 4 * 750), 200.0, dtype=np.float32)
         for j, (x, y) in enumerate(xy[i]):
@@ -51,10 +62,10 @@ def write_board(folder: Path, count: int) -> FloatArray:
             exact = (4 * (xy[i, j] + 0.5) - 0.5 - np.array(centre)) * 16
             at = (16 * centre[0] + round(exact[0]), 16 * centre[1] + round(exact[1]))
             cv2.circle(picture, at, 16 * 24, 40, -1, 8, 4)
-        small = cv2.GaussianBlur(picture, (0, 0), 3).reshape(500, 4, 750, 4).mean(axis=(1, 3))
+        small = cv2.resize(cv2.GaussianBlur(picture, (0, 0), 3), (750, 500), interpolation=cv2.INTER_AREA)
         noisy = small + rng.normal(0, 1.0, small.shape)
-        cv2.imwrite(str(folder / f"i{i}.png"), np.clip(np.rint(noisy), 0, 255).astype(np.uint8))
-    return np.asarray(xy)
+        pictures.append(np.clip(np.rint(noisy), 0, 255).astype(np.uint8))
+    return tuple(pictures), np.asarray(xy)
 
 
 @pytest.fixture(scope="module")
