@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import atexit
 import gc
+import io
 import os
 import shutil
 import tempfile
@@ -18,11 +19,13 @@ os.environ.setdefault("OMP_NUM_THREADS", "1")
 
 import matplotlib
 import pytest
-from matplotlib.backends.backend_agg import FigureCanvasAgg
+from PIL import Image
 
 from tests.places import ROOT, SHARED
 
 SHARED = SHARED / "data"
+Image.new("L", (1, 1), 255).save(_empty := io.BytesIO(), "PNG")
+EMPTY = _empty.getvalue()  # a picture
 
 os.environ.setdefault("MPLCONFIGDIR", matplotlib.get_cachedir())  # its list of fonts takes long
 CACHES = tempfile.mkdtemp(prefix="kolinear-tests-")
@@ -119,10 +122,15 @@ def plots() -> None:
 def no_plots(request: pytest.FixtureRequest, monkeypatch: pytest.MonkeyPatch) -> None:
     """Spare the plots, which take as long as a small survey, and the process that draws them.
 
-    The figures of pages that draw their own are made, and remain empty.
+    The figures of a calibration are made, and remain empty.
     """
+    from sfm.report.figures.plot_data import Plot
+
     if "plots" not in request.fixturenames:
-        monkeypatch.setattr(FigureCanvasAgg, "draw", FigureCanvasAgg.get_renderer)
+        monkeypatch.setattr(
+            "sfm.products.calibration.page.plot",
+            lambda stem, caption, _: Plot(stem, caption, EMPTY, (EMPTY,)),
+        )
         monkeypatch.setattr("sfm.report.figures.plot_process.plot_process", lambda _: nullcontext())
         monkeypatch.setattr("sfm.report.output.draw_plots", lambda _: [])
 

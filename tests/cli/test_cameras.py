@@ -67,7 +67,6 @@ def test_the_file_for_opencv_has_the_residuals(results: tuple[Path, Path], tmp_p
     assert 0.05 < storage.getNode("rms").real() < 0.15
 
 
-@pytest.mark.usefixtures("plots")
 def test_two_calibrations_of_one_camera_do_not_differ(
     results: tuple[Path, Path], tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:

@@ -123,6 +123,7 @@ def test_a_bent_board_is_seen(tmp_path: Path) -> None:
     assert "given_scatter" in kinds_of(found.remarks) and verdict_of(found).level == "fair"
 
 
+@pytest.mark.usefixtures("plots")
 def test_frontal_photographs_do_not_make_a_camera(tmp_path: Path) -> None:
     board = simulated_board(seed_of("frontal"), tilt_deg=0.0, distance=(400.0, 400.0), photographs=8)
     found = calibrate(surveyed(tmp_path, board))
@@ -132,6 +133,7 @@ def test_frontal_photographs_do_not_make_a_camera(tmp_path: Path) -> None:
     assert html(page(found)) and "not determined" in words and "Use it" not in words
 
 
+@pytest.mark.usefixtures("plots")
 def test_a_camera_that_was_not_adjusted_has_a_page(tmp_path: Path) -> None:
     """Without `free` the program holds the camera of frontal photographs."""
     board = simulated_board(seed_of("frontal"), tilt_deg=0.0, distance=(400.0, 400.0), photographs=8)

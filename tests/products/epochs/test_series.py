@@ -37,7 +37,6 @@ def series() -> EpochSeries:
     return analyse_epochs(epochs(), groups={"span": ["5", "17", "22", "41"]})
 
 
-@pytest.mark.usefixtures("plots")
 def test_each_epoch_stands_against_the_first_and_the_one_before(tmp_path: Path) -> None:
     found = series()
     assert [pair.displacements.differences.names for pair in found.pairs] == [

@@ -69,7 +69,6 @@ def accepted(result: Solution, lengths: CalibratedLengths, **options: Any) -> Ac
     )
 
 
-@pytest.mark.usefixtures("plots")
 def test_a_complete_test_is_proven(tmp_path: Path) -> None:
     found = accepted(*volume())
     assert found.verdict.level == "good" and found.lacking == () and found.count("in") == 35

@@ -201,7 +201,6 @@ def test_targets_stand_off_on_the_side_of_the_cameras(tmp_path: Path) -> None:
         measured(tmp_path, pipe)  # without a plate in the way they come from all round
 
 
-@pytest.mark.usefixtures("plots")
 def test_the_folder_holds_tables_drawing_and_page(tmp_path: Path) -> None:
     result = one_bench()
     write_tables(tmp_path / "result", result)
