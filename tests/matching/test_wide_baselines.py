@@ -10,11 +10,11 @@ import pytest
 from benchmarks.wide_matching import count_matches, photograph, points_and_truth, wide_scene
 from datasets.textured import render
 from sfm.matching import conjugate
-from sfm.matching.conjugate import affinities_around, match_points
+from sfm.matching.conjugate import KeyPoints, affinities_around, match_points
 from sfm.matching.conjugate_patches import ConjugatePoints, MatchSettings
 from sfm.matching.lsm.surface_planes import match_where_plane
 from sfm.matching.lsm.two_photo import LsmSettings, match_lsm
-from sfm.matching.tracks.features import sift_features
+from sfm.matching.tracks.features import Features, sift_features
 from sfm.model.conventions import FloatArray
 from tests.synthetic import seed_of
 from tests.textures import MEAN, affine_pairs, random_texture, with_noise
@@ -55,6 +55,31 @@ def test_key_points_lead_to_places_that_are_turned_and_scaled() -> None:
         left, right, POINTS[:2], xy_right=truth[:2] + 90.0, settings=MatchSettings(search_px=61)
     )
     assert not elsewhere.good.any()
+
+
+def test_key_points_are_extracted_once_and_only_if_points_are_lost(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    left, right, _ = _turned(75.0, 0.8)
+    third, extracted = with_noise(right, 1.0, 3), list[int]()
+
+    def features(photograph: FloatArray, **options: int) -> Features:
+        extracted.append(photograph.size)
+        return sift_features(photograph, **options)
+
+    monkeypatch.setattr(conjugate, "sift_features", features)
+    shared = KeyPoints()
+    alone = [match_points(left, other, POINTS) for other in (right, third)]
+    assert len(extracted) == 4
+    together = [match_points(left, other, POINTS, key_points=shared) for other in (right, third)]
+    assert len(extracted) == 4 + 3
+    for one, other in zip(alone, together, strict=True):
+        np.testing.assert_array_equal(one.right, other.right)
+    some = slice(None, None, 3)
+    assert _right(match_points(left, left, POINTS[some], key_points=shared), POINTS[some]) == 5
+    assert len(extracted) == 4 + 3
+    match_points(left.copy(), right, POINTS, key_points=shared)
+    assert len(extracted) == 4 + 3 + 1
 
 
 @pytest.mark.parametrize(("angle_deg", "scale"), [(27.0, 0.8), (-15.0, 1.27)])

@@ -7,11 +7,12 @@ from collections.abc import Callable
 import cv2
 import numpy as np
 import pytest
+from scipy.special import ndtr
 
 from sfm.model.conventions import AnyArray, FloatArray, IntArray
 from sfm.targets.codes.tags import DICTIONARIES, _widening, find_tags, tag_family, tag_modules
 from sfm.targets.detect import find_targets
-from sfm.targets.fits.whole_tag import fit_whole_tags
+from sfm.targets.fits.whole_tag import _model, fit_whole_tags
 from sfm.targets.outlines import Flag
 from tests.synthetic import seed_of
 
@@ -266,3 +267,19 @@ def test_letters_are_no_small_tags(seed: int) -> None:
         cv2.GaussianBlur(picture, (0, 0), 0.8), tag_family("aruco4x4_1000"), polarity="auto", scale=255.0
     )
     assert len(tags.xy) == 0 and len(tags.quads) == 0 and len(tags.rejected_xy) > 0
+
+
+def test_the_model_is_the_sum_of_the_modules_and_its_derivatives_are_those_of_differences() -> None:
+    """Of a tag seen from the front: where it is tilted the blur changes with the place, which is left out."""
+    rng = seed_of("model of a tag")
+    black = rng.random((6, 6)) < 0.5
+    P = np.column_stack([rng.uniform(-0.6, 0.6, (200, 2)), np.ones(200)])  # some of them beside it
+    theta = np.array([7.0, 0.0, 3.0, 0.0, 5.0, 3.2, 0.0, 0.0, 0.0, 0.0, 0.06])
+    share, D = _model(theta, P, black)
+    at = np.column_stack([7 * P[:, 0] + 3.0, 5 * P[:, 1] + 3.2])
+    edges = ndtr((at[:, :, None] - np.arange(7)) / (0.06 * np.array([7.0, 5.0]))[:, None])
+    W_u, W_v = (edges[:, axis, :-1] - edges[:, axis, 1:] for axis in range(2))
+    np.testing.assert_allclose(share, ((W_v @ black) * W_u).sum(axis=1), atol=1e-7)  # digits of the weights
+    for unknown, column, step in ((2, 2, 1e-5), (5, 5, 1e-5), (10, 8, 1e-7)):  # u, v and the blur
+        ends = [_model(theta + sign * step * (np.arange(11) == unknown), P, black)[0] for sign in (1, -1)]
+        np.testing.assert_allclose(D[:, column], (ends[0] - ends[1]) / (2 * step), atol=1e-6)
