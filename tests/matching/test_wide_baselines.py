@@ -129,7 +129,9 @@ def test_repeated_marks_whose_partner_is_out_of_reach_are_not_matched() -> None:
 
     def marks(u: FloatArray, v: FloatArray) -> FloatArray:
         p, q = u % step - step / 2, v % step - step / 2
-        return np.asarray(MEAN + (texture.value(p, q) - MEAN) * (np.hypot(p, q) < 25.0))
+        grey, inside = np.full(p.shape, MEAN), np.hypot(p, q) < 25.0
+        grey[inside] = texture.value(p[inside], q[inside])
+        return grey
 
     at = (np.stack([x, y], axis=-1) - middle) @ A + middle
     left, right = with_noise(marks(x, y), NOISE, 1), with_noise(marks(at[..., 0], at[..., 1]), NOISE, 2)
