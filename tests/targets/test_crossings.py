@@ -191,7 +191,7 @@ def test_bent_edges_do_not_move_crossings() -> None:
     def flat(x: FloatArray, y: FloatArray) -> tuple[FloatArray, FloatArray]:
         return x - 320 + (y - 240) ** 2 / 1400, y - 240 + (x - 320) ** 2 / 1400
 
-    x, y = ((np.arange(size * finer) + 0.5) / finer - 0.5 for size in (640, 480))
+    x, y = (((np.arange(size * finer) + 0.5) / finer - 0.5).astype(np.float32) for size in (640, 480))
     squares, inside = np.zeros((480 * finer, 640 * finer), np.int8), np.True_
     for along, count in zip(flat(x[None], y[:, None]), (columns, rows), strict=True):
         square = np.floor(along / side + (count / 2 + 0.5)).astype(np.int8)  # 0 is the border
