@@ -259,9 +259,8 @@ def _cross(layout: Unknowns, q: Inverse, L: FloatArray, mask: FloatArray) -> tup
     if len(q.YQ) == 0:
         return q.YQ, q.YQ_border
     point, first = layout.observations.point, 6 * len(q.exterior)
-    rays, inner = np.empty_like(q.YQ), np.empty_like(q.YQ_border)
-    _back_to_points(L, mask, point, q.YQ, rays)
-    _back_to_points(L, mask, np.arange(len(L)), q.YQ_border, inner)
+    rays = -solve_transposed(L[point], q.YQ) * mask[point][:, :, None]
+    inner = -solve_transposed(L, q.YQ_border) * mask[:, :, None]
     mixed = q.mixed.reshape(len(q.exterior), 6, -1)
     for s, j in enumerate(layout.kept):
         at = slice(layout.kept_start - first + 3 * s, layout.kept_start - first + 3 * s + 3)
@@ -269,30 +268,6 @@ def _cross(layout: Unknowns, q: Inverse, L: FloatArray, mask: FloatArray) -> tup
         rays[seen] = np.swapaxes(mixed[layout.observations.pose[seen], :, at], 1, 2)
         inner[j] = q.border[at]
     return rays, inner
-
-
-@kernel
-def _back_to_points(
-    L: FloatArray, mask: FloatArray, point: IntArray, YQ: FloatArray, cross: FloatArray
-) -> None:
-    """Fill in -L^-T Y'S^-1, (r, 3, q); 0 for fixed coordinates.
-
-    Args:
-        L: Cholesky factors of object points, (n, 3, 3).
-        mask: 1 for free coordinates, (n, 3).
-        point: object point of each row, (r,).
-        YQ: Y'S^-1, (r, 3, q).
-        cross: to fill.
-    """
-    for r in range(len(point)):
-        j = point[r]
-        for q in range(YQ.shape[2]):
-            z = YQ[r, 2, q] / L[j, 2, 2]
-            y = (YQ[r, 1, q] - L[j, 2, 1] * z) / L[j, 1, 1]
-            x = (YQ[r, 0, q] - L[j, 1, 0] * y - L[j, 2, 0] * z) / L[j, 0, 0]
-            cross[r, 0, q] = -x * mask[j, 0]
-            cross[r, 1, q] = -y * mask[j, 1]
-            cross[r, 2, q] = -z * mask[j, 2]
 
 
 @kernel
