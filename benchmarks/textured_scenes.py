@@ -1,19 +1,19 @@
 """Renders photographs of a textured surface of three roughnesses, with the true orientation.
 
     python -m benchmarks.textured_scenes smooth 20 build/smooth20
-    python -m benchmarks.textured_scenes medium 1000 build/block1000 block 0.625
+    python -m benchmarks.textured_scenes medium 1000 build/block1000 --layout block --finer 0.625
 
 The surface has hills and ripples. The ripples are absent, 4 mm high and 0.15 m long, or 8 mm high and 0.08 m
 long. On a dome, the camera moves around a square of 2.4 m at several elevations, and every photograph shows
 most of it. In a block, the photographs look at the nodes of a grid, tilted by 20 degrees in turn in four
-directions, and the surface is as large as their number asks for: each point is in about 13 photographs. Every
+directions, and the surface is as large as their number asks for: a point inside is in about 15 of them. Every
 other photograph is rotated by 90 degrees. Every pixel is the mean of rays over its area, blurred and with
 noise, as in datasets/textured.
 """
 
 from __future__ import annotations
 
-import sys
+import argparse
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -37,7 +37,7 @@ SLAB_M = 0.2  # half the height of that slab
 COARSE = 8  # pixels between the rays of a block that are followed from outside; the others start between them
 NODES_M = (0.36, 0.28)  # between the nodes of a block, along and across its rows
 TILT_DEG = 20.0  # of the photographs of a block
-OVERLAP_M = 0.9  # photographs that look at points nearer to each other share a third of what they show
+OVERLAP_M = 0.9  # photographs that look at points nearer to each other share 14 to 36 % of what they show
 LAYOUTS = ("dome", "block")
 SURVEY = """[survey]
 name = "{name}"
@@ -248,6 +248,13 @@ def photograph_name(index: int) -> str:
 
 
 if __name__ == "__main__":
-    of_roughness, number, into, *layout_and_finer = sys.argv[1:]
-    its_layout, finer_by = [*layout_and_finer, *("dome", "1")[len(layout_and_finer) :]]
-    render_scene(Path(into), of_roughness, int(number), float(finer_by), its_layout)
+    parser = argparse.ArgumentParser(description=__doc__.split("\n")[0] if __doc__ else "")
+    parser.add_argument("roughness", choices=list(RIPPLES))
+    parser.add_argument("photographs", type=int)
+    parser.add_argument("folder", type=Path)
+    parser.add_argument("--layout", choices=LAYOUTS, default="dome")
+    parser.add_argument("--finer", type=float, default=1.0, help="pixels along each of 1024 x 768")
+    arguments = parser.parse_args()
+    render_scene(
+        arguments.folder, arguments.roughness, arguments.photographs, arguments.finer, arguments.layout
+    )

@@ -101,7 +101,7 @@ def count_matches(left: AnyArray, right: AnyArray, xy: FloatArray, truth: FloatA
     else:
         off = np.random.default_rng(len(xy)).uniform(-OFF_PX, OFF_PX, xy.shape)
         nothing = affinities_around(xy[:0], xy[:0], xy)
-        with patch.object(conjugate, "local_affinities", lambda _l, _r, at: affinities_around(
+        with patch.object(conjugate, "local_affinities", lambda _l, _r, at, **_: affinities_around(
             nothing.xy[:0], nothing.xy[:0], at
         )):  # fmt: skip
             matches = match_points(

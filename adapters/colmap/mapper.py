@@ -61,7 +61,7 @@ def map_photographs(
         folder: folder of the photographs.
         cameras: for each camera the names of its photographs, relative to the folder.
         at_once: whether all photographs are oriented together, by the global mapper, instead of one by one.
-        pairs: names of the photographs that are compared; all with each other if not given.
+        pairs: names, without spaces, of the photographs that are compared; all with each other if not given.
         threads: threads of COLMAP; -1 uses all cores.
 
     Raises:

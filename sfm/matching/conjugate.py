@@ -86,7 +86,8 @@ TOO_LITTLE_TEXTURE = (in_words(NccFlag, NccFlag.AMBIGUOUS), in_words(LsmFlag, Ls
 class KeyPoints:
     """Key points of photographs, extracted once although each photograph is matched with several others.
 
-    They are kept as long as the photograph is.
+    They are kept as long as the array of the photograph is: one that is smoothed to be as blurred as another
+    photograph is another array.
     """
 
     def __init__(self) -> None:

@@ -8,6 +8,7 @@ from __future__ import annotations
 from collections import Counter
 from collections.abc import Iterable
 from dataclasses import dataclass, field, replace
+from functools import cached_property
 
 import numpy as np
 
@@ -20,6 +21,7 @@ from sfm.runtime.compiling import compiled, inlined, kernel
 
 STEPS, HALVINGS = 100, 20  # of Newton's method, and of one of its steps
 PIXEL_TOLERANCE = 1e-10
+EDGE_PIXELS = 9  # of each edge of a photograph, whose rays show its field of view
 PLACES = 16  # between the axis and a ray at which the distortion is tested for a fold
 # Directions in which the range without a fold is found once for many points, the radius where the search
 # begins in half diagonals of the photograph, its next radius as a part of the one before, and the part of the
@@ -97,6 +99,12 @@ class Camera:
     def in_mm(self) -> bool:
         """Whether c and the principal point are in mm on the sensor; otherwise focal lengths are in px."""
         return MODELS[self.model].in_mm
+
+    @cached_property
+    def field_angle(self) -> float:
+        """Largest angle between the axis and the rays of the edges of a photograph, up to pi / 2, rad."""
+        tangents = np.linalg.norm(tangents_from_pixel(self, border_pixels(self, EDGE_PIXELS)), axis=1)
+        return float(np.arctan(np.where(np.isfinite(tangents), tangents, np.inf)).max())
 
     @property
     def wide_angle(self) -> bool:

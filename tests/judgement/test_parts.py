@@ -10,12 +10,16 @@ import pytest
 import sfm
 from sfm.adjustment.result import Adjustment
 from sfm.judgement.hypotheses import hypotheses
+from sfm.judgement.hypotheses.alternatives import is_significant
+from sfm.judgement.hypotheses.columns import interior_columns
 from sfm.judgement.hypotheses.hypotheses import contradicted_parameters, find_causes, judge_alternatives
-from sfm.judgement.hypotheses.parts import held_parameters, of_all_parts, parts_of
-from sfm.judgement.hypotheses.score import reduce_adjustment
+from sfm.judgement.hypotheses.parts import SharedParameter, held_parameters, of_all_parts, parts_of
+from sfm.judgement.hypotheses.score import Reduced, reduce_adjustment
 from sfm.model.camera import project
+from sfm.model.conventions import BoolArray
 from sfm.model.estimate import Estimate
 from sfm.model.network import ImagePoints, Network
+from sfm.model.reduced_network import reduce_network
 from sfm.model.remarks.remark import remark
 from tests.synthetic import make_network, seed_of
 
@@ -125,25 +129,105 @@ def slightly_wrong_lens(share: float) -> Adjustment:
     return free_adjustment(network, replace(truth, cameras=(camera.with_parameters(values),)))
 
 
+def shared_parameter(parts: list[Reduced], name: str) -> SharedParameter:
+    every = held_parameters(parts)
+    cameras = parts[0].adjustment.estimate.cameras
+    return next(x for x in every for a, s in x.joint.parameters[:1] if cameras[a].names[s] == name)
+
+
+def reduced_parts(a: Adjustment) -> list[Reduced]:
+    solved = hypotheses._free_parts(a, parts_of(a.network, ~a.rejected, 12))
+    return [reduce_adjustment(part) for part in solved if part is not None]
+
+
 @pytest.mark.usefixtures("in_parts")
 def test_evidence_of_the_parts_together_is_that_of_the_network_but_for_its_links() -> None:
     a = slightly_wrong_lens(0.1)
-    solved = hypotheses._free_parts(a, parts_of(a.network, ~a.rejected, 12))
-    parts = [reduce_adjustment(part) for part in solved if part is not None]
-    k1, whole, each = (
-        next(
-            x
-            for x in held_parameters(some)
-            if x.parameters == ((0, a.estimate.cameras[0].names.index("K1")),)
-        )
-        for some in (parts, [reduce_adjustment(a)], parts[:1])
+    parts = reduced_parts(a)
+    k1, whole, each = (shared_parameter(some, "K1") for some in (parts, [reduce_adjustment(a)], parts[:1]))
+    assert len(parts) == 4 and 2 * each.joint.gain.value < k1.joint.gain.value < whole.joint.gain.value
+    # points that two parts show, the datum and free parameters are estimated in each
+    assert k1.joint.gain.value > 0.6 * whole.joint.gain.value
+    sigma = abs(k1.change) / k1.joint.gain.value**0.5
+    assert abs(k1.change - whole.change) < 2 * sigma
+    camera = a.estimate.cameras[0]
+    wanted = camera.parameters[camera.names.index("K1")] * (1 / 0.9 - 1)
+    assert abs(k1.change - wanted) < 3 * sigma
+    assert k1.joint.redundancy == sum(part.redundancy for part in parts)
+
+
+@pytest.mark.usefixtures("in_parts")
+def test_parts_whose_points_reach_differently_far_state_a_parameter_in_its_unit() -> None:
+    """The unit of a column is the change whose largest effect is 1 px, which differs from part to part."""
+    a = slightly_wrong_lens(0.3)
+    whole, inner = a.network, reduced_parts(a)
+    half = np.array(a.estimate.cameras[0].size_px) / 2
+    from_middle = np.linalg.norm(whole.image_points.xy - half, axis=1)
+    near = from_middle < np.quantile(from_middle, 0.6)
+    within = adjusted_image_points(a, near)
+    mixed = [reduce_adjustment(within), *inner[:1]]
+    k1 = shared_parameter(mixed, "K1")
+    units = [
+        interior_columns(part.adjustment, own.parameters)[2][0]
+        for part, (_, own) in zip(mixed, k1.of_parts, strict=True)
+    ]
+    assert units[0] > 1.5 * units[1]
+    change = [unit * own.gain.beta[0] for unit, (_, own) in zip(units, k1.of_parts, strict=True)]
+    information = [own.gain.value / c**2 for c, (_, own) in zip(change, k1.of_parts, strict=True)]
+    assert k1.change == pytest.approx(np.average(change, weights=information))
+    assert min(change) <= k1.change <= max(change)
+    for part, (_, own) in zip(mixed, k1.of_parts, strict=True):
+        unit = interior_columns(part.adjustment, own.parameters)[2][0]
+        assert k1.step_in(own, part.adjustment) * unit == pytest.approx(k1.change)
+
+
+def adjusted_image_points(a: Adjustment, kept: BoolArray) -> Adjustment:
+    seen = a.network.image_points
+    points = np.bincount(seen.point[kept], minlength=len(a.network.points)) > 2
+    images = np.bincount(seen.image[kept], minlength=len(a.network.images)) > 6
+    part, start = reduce_network(a.network, a.estimate, images, points, kept)
+    return free_adjustment(part, start)
+
+
+@pytest.mark.usefixtures("in_parts")
+def test_parts_that_contradict_each_other_share_no_parameter() -> None:
+    """Half of the parts demand more distortion and the others less, as if each flight were focused anew."""
+    network, truth = make_network(
+        seed_of("shared 0"), images=48, points=60, visibility=0.5, free=("c", "x0", "y0")
     )
-    assert len(parts) == 4 and 2 * each.gain.value < k1.gain.value < whole.gain.value
-    # points that two parts show are estimated in both, and each part has a datum of its own
-    assert k1.gain.value > 0.6 * whole.gain.value
-    information = k1.gain.value / k1.gain.beta[0] ** 2
-    assert abs(k1.gain.beta[0] - whole.gain.beta[0]) < 2 * information**-0.5
-    assert k1.redundancy == sum(part.redundancy for part in parts)
+    (camera,) = truth.cameras
+    k1 = np.array(camera.names) == "K1"
+    seen = network.image_points
+    xy = seen.xy.copy()
+    parts = parts_of(network, np.ones(len(seen), dtype=bool), 12)
+    for p, images in enumerate(parts):
+        other = camera.with_parameters(camera.parameters * np.where(k1, 1.5 if p % 2 else 0.9, 1.0))
+        for i in np.flatnonzero(images):
+            rows = np.flatnonzero(seen.image == i)
+            pose = truth.position[i], truth.rotation[i], truth.points[seen.point[rows]]
+            xy[rows] += project(other, *pose) - project(camera, *pose)
+    a = free_adjustment(replace(network, image_points=replace(seen, xy=xy)), truth)
+    solved = [reduce_adjustment(part) for part in hypotheses._free_parts(a, parts) if part is not None]
+    shared = shared_parameter(solved, "K1")
+    assert shared.joint.gain.value > 20, "the parts do not cancel each other"
+    assert shared.joint.spread.redundancy == len(parts) - 1 and shared.joint.spread.factor > 10
+    assert not is_significant(shared.joint, len(held_parameters(solved)), a.levels.family)
+
+
+@pytest.mark.usefixtures("in_parts")
+def test_cameras_of_a_group_in_different_parts_share_a_parameter() -> None:
+    network, truth = make_network(
+        seed_of("shared 0"), images=48, points=60, visibility=0.5, free=("c", "x0", "y0")
+    )
+    parts = parts_of(network, np.ones(len(network.image_points), dtype=bool), 12)
+    (camera,) = truth.cameras
+    group = tuple("lens" if name.startswith(("K", "P")) else "" for name in camera.names)
+    both = tuple(replace(camera, name=name, shared=group) for name in ("left", "right"))
+    two = replace(network, camera=(np.argmax(parts, axis=0) % 2).astype(np.int64))
+    a = free_adjustment(two, replace(truth, cameras=both))
+    solved = [reduce_adjustment(part) for part in hypotheses._free_parts(a, parts) if part is not None]
+    shared = shared_parameter(solved, "K1")
+    assert len(shared.of_parts) == len(solved) and {a for a, _ in shared.joint.parameters} == {0, 1}
 
 
 @pytest.mark.usefixtures("in_parts")
@@ -152,8 +236,13 @@ def test_a_lens_that_no_part_names_alone_is_named_by_all_together() -> None:
     for part in hypotheses._free_parts(a, parts_of(a.network, ~a.rejected, 12)):
         assert part is not None and not find_causes(part)
     (said,) = judge_alternatives(a).causes
-    assert said.kind == "held_parameter" and said.names("parameters")[0] in ("K1", "K2")
-    assert said.number("shift") > 1
+    assert said.kind == "held_parameter" and said.number("shift") > 1
+    (parameter,) = said.names("parameters")
+    camera = a.estimate.cameras[0]
+    held = camera.parameters[camera.names.index(parameter)]
+    fitting = held + shared_parameter(reduced_parts(a), parameter).change
+    assert said.number("value") == held and said.number("instead_of") == pytest.approx(fitting, rel=0.02)
+    assert judge_alternatives(slightly_wrong_lens(0.0)).causes == ()
 
 
 @pytest.mark.usefixtures("in_parts")

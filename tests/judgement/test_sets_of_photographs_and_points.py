@@ -17,7 +17,7 @@ from sfm.adjustment.solve import adjust
 from sfm.judgement.hypotheses import alternatives, families
 from sfm.judgement.hypotheses.alternatives import Part, runs_of
 from sfm.judgement.hypotheses.columns import rigid_motions
-from sfm.judgement.hypotheses.score import NONE, Gain, reduce_adjustment
+from sfm.judgement.hypotheses.score import NONE, Gain, gain_of, reduce_adjustment
 from sfm.model.conventions import BoolArray, FloatArray
 from sfm.survey.inputs.sources import TEXTURE
 from tests.synthetic import make_network, seed_of
@@ -259,6 +259,31 @@ def test_sets_that_are_tried_together_have_the_motions_of_each() -> None:
         np.testing.assert_allclose(body.left, alone.left, atol=1e-9)
         assert (body.fitting == alone.fitting).all() and (body.members == members).all()
     assert together[0].gain.value > max(body.gain.value for body in together[1:])
+
+
+def test_the_motion_of_a_body_is_that_of_its_columns() -> None:
+    network, truth = make_network(seed_of("columns of a body"), images=12, points=20, visibility=0.9)
+    reduced = reduce_adjustment(adjust(network, truth, datum="free", reject="tau"))
+    moves = alternatives._moves(reduced, (np.arange(12) >= 6).astype(float))
+    sets = np.array([np.isin(np.arange(len(moves.points)), members) for members in (range(6), range(4, 9))])
+    for body in alternatives._bodies_of(reduced, moves, sets):
+        points = moves.points[body.members]
+        D = families.Alternative(families.BODY, "split", moves.factor, points=points).whitened(reduced)
+        gain = gain_of(*reduced.project(D))
+        assert (body.gain.rank, body.gain.value) == (gain.rank, pytest.approx(gain.value))
+        np.testing.assert_allclose(body.gain.beta, gain.beta, rtol=1e-6, atol=1e-12)
+        # what is left are the slopes along each point's motion after that of the body
+        motion = np.zeros((len(truth.points), 3, 1))
+        for k in range(3):
+            motion[:] = 0.0
+            motion[moves.points[0], k] = 1.0
+            alone = reduced.whiten(
+                moves.factor[reduced.image][:, None, None]
+                * (reduced.columns.point[reduced.used] @ motion[reduced.point])
+            )
+            both = np.concatenate([alone, (D @ gain.beta)[:, :, None]], axis=2)
+            H, g, _ = reduced.project(both)
+            assert body.left[0, k] == pytest.approx(g[0] + H[0, 1], abs=1e-6 * abs(g[0]) + 1e-9)
 
 
 def test_a_body_that_several_points_lead_to_is_told_once() -> None:

@@ -35,7 +35,7 @@ LARGE = Run(Work(("targets",), 100, 1.0), {"targets": 40.0, "orientation": 30.0,
 def test_the_nearest_run_of_the_same_sources_is_scaled() -> None:
     work = Work(("targets",), 20, 2.0)
     expected = forecast(work, [LARGE, SMALL]).seconds
-    assert expected == pytest.approx({"targets": 20.0, "orientation": 2.0, "adjustment": 2 * 2**1.2})
+    assert expected == pytest.approx({"targets": 20.0, "orientation": 2.0, "adjustment": 2 * 2.0})
     assert forecast(Work(("targets",), 80, 1.0), [LARGE, SMALL]).seconds["targets"] == pytest.approx(32.0)
     assert forecast(SMALL.work, [SMALL]).seconds == SMALL.seconds
     assert "adjustment" not in forecast(SMALL.work, [SMALL], without=("adjustment",)).seconds

@@ -351,13 +351,16 @@ SIGMA_PX, C_PX, SIZE_PX = 0.1, 600.0, (640, 480)
 STATIONS, TIE_POINTS, DISTANCE = 6, 300, 5.0
 
 
-def turned(base_px: float, *, frontal: bool = False, distant: float = 0.0) -> tuple[Network, Estimate]:
+def turned(
+    base_px: float, *, frontal: bool = False, distant: float = 0.0, stations: int = STATIONS
+) -> tuple[Network, Estimate]:
     """Return photographs side by side, the image points of each moved by so many px against the last.
 
     Args:
         base_px: parallax of neighbours at the middle distance.
         frontal: a wall from the front; else an object in space, and the camera turns.
         distant: part of the points a hundred times as far away.
+        stations: number of photographs.
     """
     rng = seed_of("no base")
     lens = () if frontal else (("K1", -2e-4),)
@@ -365,14 +368,14 @@ def turned(base_px: float, *, frontal: bool = False, distant: float = 0.0) -> tu
         "a", "brown", SIZE_PX, (0.01, 0.01), c_mm=C_PX * 0.01, values=lens, free=("c",)
     )
     step = base_px * DISTANCE / C_PX
-    position = np.column_stack([step * np.arange(STATIONS), np.zeros((STATIONS, 2))])
-    angle = np.zeros(STATIONS) if frontal else np.linspace(-0.3, 0.3, STATIONS)
+    position = np.column_stack([step * np.arange(stations), np.zeros((stations, 2))])
+    angle = np.zeros(stations) if frontal else np.linspace(-0.3, 0.3, stations)
     depth = np.full(TIE_POINTS, DISTANCE) if frontal else rng.uniform(0.7, 3.0, TIE_POINTS) * DISTANCE
     depth = np.where(np.arange(TIE_POINTS) < distant * TIE_POINTS, 100 * DISTANCE, depth)
     spread = rng.uniform(-0.7, 0.7, (TIE_POINTS, 2))
     points = np.column_stack([spread * depth[:, None], -depth])
     names, places, xy = [], [], []
-    for i in range(STATIONS):
+    for i in range(stations):
         at = project(camera, position[i], _about_y(angle[i]), points)
         for j in np.flatnonzero((at > 0).all(axis=1) & (at < np.array(SIZE_PX)).all(axis=1)):
             names.append(f"image {i}")
@@ -380,7 +383,7 @@ def turned(base_px: float, *, frontal: bool = False, distant: float = 0.0) -> tu
             xy.append(at[j] + SIGMA_PX * rng.standard_normal(2))
     network = Network.from_arrays(names, places, np.array(xy), sigma_px=SIGMA_PX)
     given = camera_from_values("a", "brown", SIZE_PX, (0.01, 0.01), c_mm=1.3 * C_PX * 0.01, free=("c",))
-    rotation = np.tile(np.eye(3), (STATIONS, 1, 1))
+    rotation = np.tile(np.eye(3), (stations, 1, 1))
     return network, Estimate((given,), position, rotation, np.zeros((len(network.points), 3)))
 
 
@@ -397,6 +400,24 @@ def test_photographs_from_one_place_are_refused_with_their_parallax(parallax: fl
     ) as told:
         refuse_no_base(network, start.cameras)
     assert "mask the background" not in str(told.value)
+
+
+def test_of_many_photographs_a_few_pairs_show_a_base_and_all_show_that_there_is_none() -> None:
+    network, start = turned(0.0, stations=50)
+    with pytest.raises(GeometryError, match="no base: the 50 photographs were taken from one position"):
+        refuse_no_base(network, start.cameras)
+    network, start = turned(2.0 * MIN_PARALLAX * SIGMA_PX, stations=50)
+    rows: list[int] = []
+    measured = lost_photographs._least_parallax
+
+    def counted(*given: Any) -> FloatArray | None:
+        rows.append(len(given[2]))
+        return measured(*given)
+
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(lost_photographs, "_least_parallax", counted)
+        refuse_no_base(network, start.cameras)
+    assert len(rows) == 1 and rows[0] < 49
 
 
 def test_photographs_without_any_motion_may_show_an_object_that_turns() -> None:

@@ -7,7 +7,6 @@ from collections.abc import Callable
 import cv2
 import numpy as np
 import pytest
-from scipy.special import ndtr
 
 from sfm.model.conventions import AnyArray, FloatArray, IntArray
 from sfm.targets.codes.tags import DICTIONARIES, _widening, find_tags, tag_family, tag_modules
@@ -269,17 +268,27 @@ def test_letters_are_no_small_tags(seed: int) -> None:
     assert len(tags.xy) == 0 and len(tags.quads) == 0 and len(tags.rejected_xy) > 0
 
 
-def test_the_model_is_the_sum_of_the_modules_and_its_derivatives_are_those_of_differences() -> None:
-    """Of a tag seen from the front: where it is tilted the blur changes with the place, which is left out."""
+@pytest.mark.parametrize("shear", [0.0, 1.6])
+def test_the_model_is_the_sum_of_the_modules_and_its_derivatives_are_those_of_differences(
+    shear: float,
+) -> None:
+    """Of a tag without perspective, whose blur is the same everywhere; sheared, it is along a direction."""
     rng = seed_of("model of a tag")
     black = rng.random((6, 6)) < 0.5
-    P = np.column_stack([rng.uniform(-0.6, 0.6, (200, 2)), np.ones(200)])  # some of them beside it
-    theta = np.array([7.0, 0.0, 3.0, 0.0, 5.0, 3.2, 0.0, 0.0, 0.0, 0.0, 0.06])
+    P = np.column_stack([rng.uniform(-0.6, 0.6, (60, 2)), np.ones(60)])  # some of them beside it
+    theta = np.array([7.0, shear, 3.0, -shear / 2, 5.0, 3.2, 0.0, 0.0, 0.0, 0.0, 0.06])
     share, D = _model(theta, P, black)
-    at = np.column_stack([7 * P[:, 0] + 3.0, 5 * P[:, 1] + 3.2])
-    edges = ndtr((at[:, :, None] - np.arange(7)) / (0.06 * np.array([7.0, 5.0]))[:, None])
-    W_u, W_v = (edges[:, axis, :-1] - edges[:, axis, 1:] for axis in range(2))
-    np.testing.assert_allclose(share, ((W_v @ black) * W_u).sum(axis=1), atol=1e-7)  # digits of the weights
+    A = theta[[0, 1, 3, 4]].reshape(2, 2)
+    at = P[:, :2] @ A.T + theta[[2, 5]]
+    fine = (np.arange(6 * 40) + 0.5) / 40
+    away = np.stack(np.meshgrid(fine, fine), axis=-1)[None] - at[:, None, None]  # rows are v
+    inverse = np.linalg.inv(0.06**2 * A @ A.T)
+    density = np.exp(-0.5 * np.einsum("nvua,ab,nvub->nvu", away, inverse, away))
+    density *= np.sqrt(np.linalg.det(inverse)) / (2 * np.pi) / 40**2
+    exact = (density * np.kron(black, np.ones((40, 40)))).sum(axis=(1, 2))
+    np.testing.assert_allclose(share, exact, atol=1e-3)  # of the grid and of five nodes
     for unknown, column, step in ((2, 2, 1e-5), (5, 5, 1e-5), (10, 8, 1e-7)):  # u, v and the blur
         ends = [_model(theta + sign * step * (np.arange(11) == unknown), P, black)[0] for sign in (1, -1)]
         np.testing.assert_allclose(D[:, column], (ends[0] - ends[1]) / (2 * step), atol=1e-6)
+    for row in (0, 3):
+        np.testing.assert_allclose(D[:, row : row + 2], D[:, [row + 2]] * P[:, :2], atol=1e-12)

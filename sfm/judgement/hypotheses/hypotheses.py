@@ -27,7 +27,6 @@ from sfm.judgement.hypotheses.alternatives import (
     MIN_GROUP,
     alternatives_of,
     cameras_of_photographs,
-    interiors,
     is_significant,
 )
 from sfm.judgement.hypotheses.columns import columns_of
@@ -195,28 +194,31 @@ def _free_parts(final: Adjustment, parts: Sequence[BoolArray]) -> Iterator[Adjus
 def _shared_by_parts(
     solved: Sequence[tuple[Adjustment, Reduced]], causes: Sequence[Cause], unit: str
 ) -> list[Remark]:
-    """Return the remark on the held parameter that all parts together demand, if none of them names one.
+    """Return the remark on the held parameter that all parts together demand, if no part names it alone.
 
-    It shifts the part most that gains most by it.
+    It is told of the part that gains most by it.
     """
-    if not solved or any(isinstance(cause.alternative.family, InteriorFamily) for cause in causes):
+    if not solved:
         return []
     every, level = held_parameters([reduced for _, reduced in solved]), solved[0][0].levels.family
-    shared = max(every, key=attrgetter("evidence"), default=None)
-    if shared is None or not (is_significant(shared, len(every), level) and shared.evidence > -np.log(level)):
+    shared = max(every, key=lambda parameter: parameter.joint.evidence, default=None)
+    if shared is None or not shared.joint.evidence > -np.log(level):
         return []
-    own = [
-        (interior, plain)
-        for plain, reduced in solved
-        for interior in interiors(reduced, HELD)
-        if interior.parameters == shared.parameters
-    ]
-    clearest, plain = max(own, key=lambda of_part: of_part[0].gain.value)
-    refitted = refit(plain, clearest, plain, least=-np.inf)
+    named = {
+        pair for cause in causes if cause.alternative.family == HELD for pair in cause.alternative.parameters
+    }
+    if not named.isdisjoint(shared.joint.parameters) or not is_significant(shared.joint, len(every), level):
+        return []
+    p, own = max(shared.of_parts, key=lambda of_part: of_part[1].gain.value)
+    plain = solved[p][0]
+    beta, seen = shared.step_in(own, plain), plain.network.image_points
+    with_it = replace(seen, xy=seen.xy - own.columns(plain, columns_of(plain)) @ beta)
+    refitted = readjusted(plain, replace(plain.network, image_points=with_it), plain)
     if refitted is None:
         return []
-    cause = Cause(shared, replace(refitted, beta=shared.gain.beta), ())
-    return [remark_of(plain, cause, unit, WITHOUT)]
+    gain = log_likelihood_of(refitted) - log_likelihood_of(plain)
+    cause = Cause(own, Refit(refitted, beta, gain, *shifts_of(plain, plain, refitted, own, beta)), ())
+    return [remark_of(plain, cause, unit, WITHOUT)] if cause.matters else []
 
 
 def _judge_free(plain: Adjustment | None, unit: str, without: str | None) -> JudgedAssumptions:
@@ -514,17 +516,18 @@ def contradicted_parameters(a: Adjustment) -> tuple[tuple[str, str], ...]:
     Each improves the fit of the finished adjustment beyond chance when it alone is freed. Of a large network,
     the evidence of its parts is added.
     """
+    if not a.converged or not a.sigma0 > 0 or a.redundancy < 2:
+        return ()
     if len(a.network.images) <= MAX_PHOTOGRAPHS:
         solved: Iterable[Adjustment | None] = [free_network(a)]
     else:
         solved = _free_parts(a, parts_of(a.network, ~a.rejected, PART_PHOTOGRAPHS))
-    plain, reduced = a, list[Reduced]()
+    reduced = list[Reduced]()
     for part in solved:
         with suppress(np.linalg.LinAlgError):
             if part is not None:
                 reduced.append(reduce_adjustment(part))
-                plain = part
-    every, level = held_parameters(reduced), plain.levels.family
+    every, level = [parameter.joint for parameter in held_parameters(reduced)], a.levels.family
     significant = [interior for interior in every if is_significant(interior, len(every), level)]
     contradicted = sorted(significant, key=lambda interior: -interior.gain.value)
     names = []

@@ -2,27 +2,35 @@
 
 The tests need dense normal equations, whose time grows with the cube of the photographs. A network is halved
 where fewest photographs have points in common, and so are its halves. The level of a question is divided by
-the number of parts. What the cameras of all parts share has less evidence in each. The steps of one interior
-parameter are therefore combined, with the information of each part as its weight.
+the number of parts and one, for all of them together: what the cameras of all parts share has less evidence
+in each. Its estimates by the parts are therefore combined, with their information as weights. Free parameters
+of the cameras are eliminated in each part alone, so this states less evidence than the whole network has.
+Parts that contradict each other are no evidence for a common value: their scatter then takes the place of
+that of single photographs.
 
 Source: George (1973), SIAM J. Numer. Anal. 10(2) (dissection); Bonferroni's inequality; Koch (1999),
-Parameter Estimation and Hypothesis Testing in Linear Models, sec. 3.2 (normal equations of groups add up).
+Parameter Estimation and Hypothesis Testing in Linear Models, sec. 3.2 (weighted mean); Cochran (1954),
+Biometrics 10 (scatter of estimates of one value).
 """
 
 from __future__ import annotations
 
 from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import replace
+from typing import NamedTuple
 
 import numpy as np
 from scipy.sparse import csr_matrix
 from scipy.sparse.csgraph import connected_components
 
 from sfm.adjustment.engine.solvers.fronts import halve
+from sfm.adjustment.result import Adjustment
 from sfm.judgement.hypotheses.alternatives import interiors
+from sfm.judgement.hypotheses.columns import interior_columns
 from sfm.judgement.hypotheses.families import HELD, Alternative
-from sfm.judgement.hypotheses.score import Gain, Reduced
-from sfm.model.conventions import BoolArray
+from sfm.judgement.hypotheses.score import Gain, Reduced, Spread
+from sfm.model.conventions import BoolArray, FloatArray
+from sfm.model.distributions import chi2_isf
 from sfm.model.estimate import Estimate
 from sfm.model.likelihood import price_of
 from sfm.model.network import ImagePoints, Network
@@ -91,47 +99,71 @@ def reduced_to(
         yield part, replace(start, cameras=cameras), rows
 
 
-def held_parameters(parts: Sequence[Reduced]) -> list[Alternative]:
-    """Return an alternative for each held interior parameter, with the evidence of all parts together.
+class SharedParameter(NamedTuple):
+    """A held interior parameter, with the evidence of all parts together."""
 
-    Its photographs are those of the parts, one after another.
+    joint: Alternative  # its photographs are those of the parts, one after another
+    change: float  # of the parameter, in its unit
+    of_parts: tuple[tuple[int, Alternative], ...]  # number of each part that determines it, and its own test
+
+    def step_in(self, part: Alternative, a: Adjustment) -> FloatArray:
+        """Return the change in the unit of the column of a part, (1,)."""
+        return np.array([self.change / interior_columns(a, part.parameters)[2][0]])
+
+
+def held_parameters(parts: Sequence[Reduced]) -> list[SharedParameter]:
+    """Return each held interior parameter with the evidence of all parts together.
 
     Args:
         parts: networks that have only cameras in common.
     """
-    of_parameter: dict[tuple[tuple[int, int], ...], list[tuple[Alternative, Reduced]]] = {}
-    for part in parts:
+    of_parameter: dict[tuple[str, str], list[tuple[int, Alternative]]] = {}
+    for p, part in enumerate(parts):
+        cameras = part.adjustment.estimate.cameras
         for interior in interiors(part, HELD):
             if len(interior.gain.beta) == 1:
-                of_parameter.setdefault(interior.parameters, []).append((interior.priced(part), part))
-    return [_together(of_parts) for of_parts in of_parameter.values()]
+                index, s = interior.parameters[0]
+                of_both = cameras[index].owner_of(s), cameras[index].names[s]
+                of_parameter.setdefault(of_both, []).append((p, interior.priced(part)))
+    return [_together(parts, of_parts) for of_parts in of_parameter.values()]
 
 
-def _together(of_parts: Sequence[tuple[Alternative, Reduced]]) -> Alternative:
-    """Return the alternative of one parameter with the evidence of several parts."""
-    every = [alternative for alternative, _ in of_parts]
-    step = np.array([alternative.gain.beta[0] for alternative in every])
-    information = np.array([alternative.gain.value for alternative in every]) / step**2
+def _together(parts: Sequence[Reduced], of_parts: Sequence[tuple[int, Alternative]]) -> SharedParameter:
+    """Return one parameter with the evidence of the parts that determine it."""
+    every = [alternative for _, alternative in of_parts]
+    units = np.array([interior_columns(parts[p].adjustment, own.parameters)[2][0] for p, own in of_parts])
+    change = np.array([own.gain.beta[0] for own in every]) * units
+    information = np.array([own.gain.value for own in every]) / change**2
     total = float(information.sum())
-    mean = float(information @ step) / total
-    spread = every[0].spread
-    spread = replace(
-        spread,
-        factor=float(information @ [alternative.spread.factor for alternative in every]) / total,
-        redundancy=sum(alternative.spread.redundancy for alternative in every),
-    )
+    mean = float(information @ change) / total
+    level = parts[0].adjustment.levels.family
+    apart = float(information @ (change - mean) ** 2)
+    if len(every) > 1 and apart > chi2_isf(level, len(every) - 1):
+        spread = Spread(apart / (len(every) - 1), len(every) - 1, among=False)
+    else:
+        scores, photographs = 0.0, 0
+        for (p, own), unit in zip(of_parts, units, strict=True):
+            step = own.whitened(parts[p])[:, :, 0] * (mean / unit)
+            scores += float((parts[p].scores(step, step) ** 2).sum())
+            photographs += parts[p].photographs
+        m = max(photographs, 2)
+        spread = Spread(scores / (total * mean**2) * m / (m - 1), m - 1, among=False)
+    if len(every) == 1:
+        spread = every[0].spread
+    search = every[0].search
     joint = replace(
         every[0],
-        factor=np.concatenate([alternative.factor for alternative in every]),
+        factor=np.concatenate([own.factor for own in every]),
+        parameters=tuple(dict.fromkeys(pair for own in every for pair in own.parameters)),
         gain=Gain(total * mean**2, 1, np.array([mean])),
         spread=spread,
-        price=price_of(1, sum(len(part.image) for _, part in of_parts), every[0].search),
-        redundancy=sum(alternative.redundancy for alternative in every),
+        price=price_of(1, sum(len(parts[p].image) for p, _ in of_parts), search),
+        redundancy=sum(own.redundancy for own in every),
     )
-    if not joint.evidence_beside_spread > 0:
-        return joint  # not significant in any case
-    effects = [part.design_effect(alternative.whitened(part)) for alternative, part in of_parts]
-    return replace(joint, design_effect=float(information @ effects) / total)
+    if joint.evidence_beside_spread > 0:  # else it is not significant in any case
+        effects = [parts[p].design_effect(own.whitened(parts[p])) for p, own in of_parts]
+        joint = replace(joint, design_effect=float(information @ effects) / total)
+    return SharedParameter(joint, mean, tuple(of_parts))
 
 
 def of_all_parts(said: Sequence[Remark]) -> tuple[Remark, ...]:

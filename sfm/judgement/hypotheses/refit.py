@@ -16,6 +16,7 @@ from __future__ import annotations
 
 from collections import defaultdict
 from collections.abc import Iterator, Sequence
+from contextlib import suppress
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -164,34 +165,34 @@ def _stepped(
 def readjusted(plain: Adjustment, network: Network, start: Adjustment) -> Adjustment | None:
     """Adjust other image points of a network as it was adjusted; None without a tested solution.
 
-    Its covariance is not computed.
+    The start is near: undamped steps reach the optimum in fewer, and damped ones are taken where they do not.
+    A covariance is computed only where errors in common leave less redundancy.
 
     Args:
         plain: adjustment of the network, with the datum, weights and level of rejection.
         network: the network with the other image points.
         start: start values, and which image points are rejected at first.
     """
-    try:
-        adjusted = adjust(
-            network,
-            start.estimate,
-            datum=Datum("control" if plain.datum == "control" else "free"),
-            reject="tau",
-            false_alarm=plain.false_alarm,
-            rejected=start.rejected,
-            covariance=bool((network.share < 1).any()),  # for what errors in common leave of the redundancy
-            options=AdjustmentOptions(
-                image_sigma_factor=plain.image_sigma_factor,
-                method="gauss-newton",
-                alpha=plain.test_alpha,
-                max_iterations=MAX_ITERATIONS,
-            ),
-        )
-    except GeometryError:
-        return None
-    if not adjusted.converged or adjusted.redundancy < 1:  # it may reject all but what it needs
-        return None
-    return replace(adjusted, error_correlation=plain.error_correlation)  # the best known one
+    for method in ("gauss-newton", "levenberg-marquardt"):
+        with suppress(GeometryError):
+            adjusted = adjust(
+                network,
+                start.estimate,
+                datum=Datum("control" if plain.datum == "control" else "free"),
+                reject="tau",
+                false_alarm=plain.false_alarm,
+                rejected=start.rejected,
+                covariance=bool((network.share < 1).any()),
+                options=AdjustmentOptions(
+                    image_sigma_factor=plain.image_sigma_factor,
+                    method=method,
+                    alpha=plain.test_alpha,
+                    max_iterations=MAX_ITERATIONS,
+                ),
+            )
+            if adjusted.converged and adjusted.redundancy >= 1:  # it may reject all but what it needs
+                return replace(adjusted, error_correlation=plain.error_correlation)  # the best known one
+    return None
 
 
 def _side_by_side(every: Sequence[Alternative], a: Adjustment, columns: Columns) -> FloatArray:

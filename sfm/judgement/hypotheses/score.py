@@ -510,12 +510,10 @@ def determined_inverse(H: FloatArray, squares: FloatArray, least: float = MIN_DE
     return np.asarray(half @ half.T)
 
 
-def gains_of(
-    H: FloatArray, g: FloatArray, squares: FloatArray, least: float = MIN_DETERMINED_SHARE
-) -> tuple[FloatArray, IntArray, FloatArray]:
+def gains_of(H: FloatArray, g: FloatArray, squares: FloatArray) -> tuple[FloatArray, IntArray, FloatArray]:
     """Return gains (n,), ranks (n,) and steps (n, q) of separate alternatives, see `gain_of`."""
     values, vectors, scale = directions_of(H, squares)
-    good = values > least
+    good = values > MIN_DETERMINED_SHARE
     projected = np.einsum("nij,ni->nj", vectors, scale * g)
     steps = np.where(good, projected / np.where(good, values, 1.0), 0.0)
     beta = -scale * np.einsum("nij,nj->ni", vectors, steps)

@@ -11,7 +11,7 @@ from collections.abc import Iterable, Sequence
 import cv2
 import numpy as np
 
-from sfm.model.camera import Camera, pixel_from_tangents, ray_directions, tangents_from_pixel
+from sfm.model.camera import pixel_from_tangents, ray_directions, tangents_from_pixel
 from sfm.model.conventions import AnyArray, BoolArray, FloatArray, IntArray
 from sfm.model.estimate import Estimate
 from sfm.model.network import ImagePoints, rows_of
@@ -19,8 +19,9 @@ from sfm.runtime.compiling import compiled
 
 # Ratio of precisions for the same pixels up to which the preferred windows are used.
 MAX_COST_RATIO = 1.1
-EDGE_STEPS = 9  # rays along each edge of a photograph that show its field of view
-FIELD_MARGIN = 1.05  # factor of its angle, for what lies between these rays
+# Factor of the angle of the field of view: with decentring, the widest ray of an edge is not at its corners,
+# and lies between those that are computed.
+FIELD_MARGIN = 1.05
 MAX_SHARED_FRACTION = 0.15  # of the pixels of a point, or of a window, that others may have measured
 SAMPLES = np.linspace(-0.42, 0.42, 6)  # positions in a window, in sides, where coverage is checked
 
@@ -193,7 +194,7 @@ def photographs_towards(estimate: Estimate, camera: IntArray, points: FloatArray
     oriented = np.flatnonzero(estimate.oriented)
     if not len(points):
         return oriented[:0]
-    widest = np.array([_field_angle(lens) for lens in estimate.cameras])[camera[oriented]]
+    widest = FIELD_MARGIN * np.array([lens.field_angle for lens in estimate.cameras])[camera[oriented]]
     middle = (points.min(axis=0) + points.max(axis=0)) / 2
     radius = float(np.linalg.norm(points - middle, axis=1).max())
     ray = middle - estimate.position[oriented]
@@ -205,18 +206,6 @@ def photographs_towards(estimate: Estimate, camera: IntArray, points: FloatArray
     inside = distance <= radius
     ball = np.arcsin(np.minimum(radius / np.where(inside, np.inf, distance), 1.0))
     return np.asarray(oriented[inside | (off_axis <= widest + ball)])
-
-
-def _field_angle(lens: Camera) -> float:
-    """Return the largest angle between the axis of a camera and the rays of the edges of its photographs."""
-    across = np.linspace(0.0, 1.0, EDGE_STEPS)
-    low, high = np.zeros_like(across), np.ones_like(across)
-    edges = np.concatenate([
-        np.column_stack(side) for side in ((across, low), (across, high), (low, across), (high, across))
-    ])  # fmt: skip
-    tangents = tangents_from_pixel(lens, edges * (np.array(lens.size_px) - 1.0))
-    angles = np.arctan(np.linalg.norm(tangents, axis=1))
-    return float(np.where(np.isfinite(angles), angles, np.pi / 2).max()) * FIELD_MARGIN
 
 
 def plane_warps(

@@ -70,7 +70,9 @@ TRIMMINGS = 3  # rotations without the half of the pairs of rays that fits worst
 # hundredths.
 MAX_RADIAL = 0.2
 STEP = 0.02  # first step of the radial distortion
-PAIRS_FIRST = 20  # about so many pairs are tried first: if these have a base, the others are not needed
+# About so many pairs, spread over the network, are tried first. Two values of c and distortion are sought,
+# which a few pairs determine; where rotations do not fit these, they do not fit all.
+PAIRS_FIRST = 20
 EVALUATIONS = 80  # of the parallax, by the simplex method of Nelder and Mead
 C_FACTORS = (1.4, 0.7, 2.0, 0.5)  # of the given principal distance: a crop factor, an extender, a zoom
 # RMS residual, in standard deviations of image points, from which another minimum is searched. It saves the
@@ -361,11 +363,13 @@ def refuse_no_base(network: Network, cameras: tuple[Camera, ...]) -> None:
     if parallax.max() < needed:  # no rotation either, whatever the camera
         turns = "; if the object turns before a background that stands still, mask the background"
     else:
-        for tried in (pairs[:: 1 + len(pairs) // PAIRS_FIRST], pairs):
-            least = _least_parallax(network, cameras, tried)
-            if least is None or not least.max() < needed:
-                return
-            parallax = least
+        few = pairs[:: 1 + len(pairs) // PAIRS_FIRST]
+        least = _least_parallax(network, cameras, few)
+        if len(few) < len(pairs) and (least is None or least.max() < needed):
+            least = _least_parallax(network, cameras, pairs)
+        if least is None or not least.max() < needed:
+            return
+        parallax = least
     raise GeometryError(
         f"orientation: no base: the {len(network.images)} photographs were taken from one position; "
         f"rotations alone fit {MAX_DISTANT_FRACTION:.0%} of their points to {np.median(parallax):.2g} px, "

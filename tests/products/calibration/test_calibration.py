@@ -111,6 +111,7 @@ def test_page_and_remarks_test_residuals_at_one_level(sound: Calibration) -> Non
     assert "It is insufficient" not in text(page(changed))
 
 
+@pytest.mark.usefixtures("plots")
 def test_a_bent_board_is_seen(tmp_path: Path) -> None:
     found = calibrate(surveyed(tmp_path, simulated_board(seed_of("calibration"), photographs=16, bent=2.0)))
     assert found.shape is not None and found.shape.flat

@@ -6,6 +6,7 @@ import json
 from pathlib import Path
 
 import numpy as np
+import pytest
 
 import sfm
 from sfm.adjustment.solve import predict
@@ -80,6 +81,7 @@ def test_stated_sigmas_are_true_beyond_90_degrees() -> None:
     assert 0.9 < np.sqrt((ratio**2).mean()) < 1.1 and ((ratio > 0.7) & (ratio < 1.3)).all()
 
 
+@pytest.mark.usefixtures("plots")
 def test_a_fisheye_of_190_degrees_is_calibrated_from_nothing(tmp_path: Path) -> None:
     """Without poses, and with c wrong by 10 %: the command gives the camera, and does not doubt it."""
     path = write_fisheye_survey(tmp_path / "s", "fisheye", c_mm=1.6)
