@@ -13,7 +13,7 @@ from sfm.judgement.hypotheses import hypotheses
 from sfm.judgement.hypotheses.alternatives import is_significant
 from sfm.judgement.hypotheses.columns import interior_columns
 from sfm.judgement.hypotheses.hypotheses import contradicted_parameters, find_causes, judge_alternatives
-from sfm.judgement.hypotheses.parts import SharedParameter, held_parameters, of_all_parts, parts_of
+from sfm.judgement.hypotheses.parts import SharedEvidence, SharedParameter, of_all_parts, parts_of
 from sfm.judgement.hypotheses.score import Reduced, reduce_adjustment
 from sfm.model.camera import project
 from sfm.model.conventions import BoolArray
@@ -129,8 +129,15 @@ def slightly_wrong_lens(share: float) -> Adjustment:
     return free_adjustment(network, replace(truth, cameras=(camera.with_parameters(values),)))
 
 
+def together(parts: list[Reduced]) -> list[SharedParameter]:
+    evidence = SharedEvidence()
+    for part in parts:
+        evidence.add(part)
+    return evidence.together(parts[0].adjustment.levels.family)
+
+
 def shared_parameter(parts: list[Reduced], name: str) -> SharedParameter:
-    every = held_parameters(parts)
+    every = together(parts)
     cameras = parts[0].adjustment.estimate.cameras
     return next(x for x in every for a, s in x.joint.parameters[:1] if cameras[a].names[s] == name)
 
@@ -168,17 +175,17 @@ def test_parts_whose_points_reach_differently_far_state_a_parameter_in_its_unit(
     mixed = [reduce_adjustment(within), *inner[:1]]
     k1 = shared_parameter(mixed, "K1")
     units = [
-        interior_columns(part.adjustment, own.parameters)[2][0]
-        for part, (_, own) in zip(mixed, k1.of_parts, strict=True)
+        interior_columns(part.adjustment, test.own.parameters)[2][0]
+        for part, test in zip(mixed, k1.of_parts, strict=True)
     ]
     assert units[0] > 1.5 * units[1]
-    change = [unit * own.gain.beta[0] for unit, (_, own) in zip(units, k1.of_parts, strict=True)]
-    information = [own.gain.value / c**2 for c, (_, own) in zip(change, k1.of_parts, strict=True)]
+    change = [unit * test.own.gain.beta[0] for unit, test in zip(units, k1.of_parts, strict=True)]
+    information = [test.own.gain.value / c**2 for c, test in zip(change, k1.of_parts, strict=True)]
     assert k1.change == pytest.approx(np.average(change, weights=information))
     assert min(change) <= k1.change <= max(change)
-    for part, (_, own) in zip(mixed, k1.of_parts, strict=True):
-        unit = interior_columns(part.adjustment, own.parameters)[2][0]
-        assert k1.step_in(own, part.adjustment) * unit == pytest.approx(k1.change)
+    for part, test in zip(mixed, k1.of_parts, strict=True):
+        step = test.own.whitened(part)[:, :, 0] * (k1.change / test.unit)
+        np.testing.assert_allclose(test.scores(k1.change), part.scores(step, step), atol=1e-9)
 
 
 def adjusted_image_points(a: Adjustment, kept: BoolArray) -> Adjustment:
@@ -211,7 +218,7 @@ def test_parts_that_contradict_each_other_share_no_parameter() -> None:
     shared = shared_parameter(solved, "K1")
     assert shared.joint.gain.value > 20, "the parts do not cancel each other"
     assert shared.joint.spread.redundancy == len(parts) - 1 and shared.joint.spread.factor > 10
-    assert not is_significant(shared.joint, len(held_parameters(solved)), a.levels.family)
+    assert not is_significant(shared.joint, len(together(solved)), a.levels.family)
 
 
 @pytest.mark.usefixtures("in_parts")

@@ -31,7 +31,7 @@ from sfm.judgement.hypotheses.alternatives import (
 )
 from sfm.judgement.hypotheses.columns import columns_of
 from sfm.judgement.hypotheses.families import HELD, MOVED, Alternative, InteriorFamily, PointFamily
-from sfm.judgement.hypotheses.parts import held_parameters, of_all_parts, parts_of, reduced_to
+from sfm.judgement.hypotheses.parts import SharedEvidence, of_all_parts, parts_of, reduced_to
 from sfm.judgement.hypotheses.refit import (
     Refit,
     log_likelihood_of,
@@ -154,19 +154,21 @@ def _judge_parts(final: Adjustment, unit: str) -> JudgedAssumptions:
     network = final.network
     parts = parts_of(network, ~final.rejected, PART_PHOTOGRAPHS)
     causes, said, tested = list[Cause](), list[Remark](), np.zeros(len(network.images), dtype=bool)
-    solved: list[tuple[Adjustment, Reduced]] = []
+    solved, shared = list[Adjustment](), SharedEvidence()
     for images, plain in zip(parts, _free_parts(final, parts), strict=True):
         if plain is None:
             continue
         try:
-            accepted, reduced = find_causes(plain), reduce_adjustment(plain)
+            reduced = reduce_adjustment(plain)
+            accepted = find_causes(plain, reduced)
         except np.linalg.LinAlgError:
             continue
         tested |= images
-        solved.append((plain, reduced))
+        solved.append(plain)
+        shared.add(reduced)
         causes += accepted
         said += [remark_of(plain, cause, unit, WITHOUT) for cause in accepted]
-    said += _shared_by_parts(solved, causes, unit)
+    said += _shared_by_parts(solved, shared, causes, unit)
     joined, unchecked = of_all_parts(said), []
     names = [[network.images[i] for i in np.flatnonzero(tested == which)] for which in (False, True)]
     if tested.any():
@@ -192,7 +194,7 @@ def _free_parts(final: Adjustment, parts: Sequence[BoolArray]) -> Iterator[Adjus
 
 
 def _shared_by_parts(
-    solved: Sequence[tuple[Adjustment, Reduced]], causes: Sequence[Cause], unit: str
+    solved: Sequence[Adjustment], evidence: SharedEvidence, causes: Sequence[Cause], unit: str
 ) -> list[Remark]:
     """Return the remark on the held parameter that all parts together demand, if no part names it alone.
 
@@ -200,7 +202,8 @@ def _shared_by_parts(
     """
     if not solved:
         return []
-    every, level = held_parameters([reduced for _, reduced in solved]), solved[0][0].levels.family
+    level = solved[0].levels.family
+    every = evidence.together(level)
     shared = max(every, key=lambda parameter: parameter.joint.evidence, default=None)
     if shared is None or not shared.joint.evidence > -np.log(level):
         return []
@@ -209,9 +212,9 @@ def _shared_by_parts(
     }
     if not named.isdisjoint(shared.joint.parameters) or not is_significant(shared.joint, len(every), level):
         return []
-    p, own = max(shared.of_parts, key=lambda of_part: of_part[1].gain.value)
-    plain = solved[p][0]
-    beta, seen = shared.step_in(own, plain), plain.network.image_points
+    clearest = max(shared.of_parts, key=lambda test: test.own.gain.value)
+    plain, own = solved[clearest.part], clearest.own
+    beta, seen = np.array([shared.change / clearest.unit]), plain.network.image_points
     with_it = replace(seen, xy=seen.xy - own.columns(plain, columns_of(plain)) @ beta)
     refitted = readjusted(plain, replace(plain.network, image_points=with_it), plain)
     if refitted is None:
@@ -311,11 +314,16 @@ def remark_of(plain: Adjustment, cause: Cause, unit: str, without: str | None = 
     )
 
 
-def find_causes(plain: Adjustment) -> tuple[Cause, ...]:
-    """Return the accepted alternatives, clearest first, for an adjustment of the image points alone."""
+def find_causes(plain: Adjustment, reduced: Reduced | None = None) -> tuple[Cause, ...]:
+    """Return the accepted alternatives, clearest first, for an adjustment of the image points alone.
+
+    Args:
+        plain: the adjustment.
+        reduced: the same with all unknowns eliminated, if that is known.
+    """
     causes: tuple[Cause, ...] = ()
     for _ in range(MAX_CAUSES):
-        cause = _best(plain, causes)
+        cause = _best(plain, causes, reduced=None if causes else reduced)
         if cause is None:
             break
         causes = _still_needed(plain, causes, cause)
@@ -335,16 +343,17 @@ def _best(
     causes: tuple[Cause, ...] = (),
     *,
     beside: Sequence[tuple[Alternative, Refit]] = (),
+    reduced: Reduced | None = None,
 ) -> Cause | None:
     """Return the accepted alternative, in addition to known causes, that gives the best adjustment.
 
     The alternatives with most evidence are adjusted, because the score test is linear: for a large error it
-    favours the alternative with most parameters. Those of `beside` are adjusted already.
+    favours the alternative with most parameters. Those of `beside` are adjusted already. `reduced` is `plain`
+    with all unknowns eliminated, if that is known.
     """
     current = causes[-1].refit.adjustment if causes else plain
     before = [(cause.alternative, cause.refit.beta) for cause in causes]
-    kept = causes[-1].refit.reduced if causes else None
-    reduced = kept or reduce_adjustment(current)
+    reduced = (causes[-1].refit.reduced if causes else reduced) or reduce_adjustment(current)
     every, level = alternatives_of(reduced), plain.levels.family
     to_try = _to_adjust(every, level)
     work = max(len(to_try), 1) * len(plain.network.images) ** 3
@@ -522,12 +531,12 @@ def contradicted_parameters(a: Adjustment) -> tuple[tuple[str, str], ...]:
         solved: Iterable[Adjustment | None] = [free_network(a)]
     else:
         solved = _free_parts(a, parts_of(a.network, ~a.rejected, PART_PHOTOGRAPHS))
-    reduced = list[Reduced]()
+    evidence, level = SharedEvidence(), a.levels.family
     for part in solved:
         with suppress(np.linalg.LinAlgError):
             if part is not None:
-                reduced.append(reduce_adjustment(part))
-    every, level = [parameter.joint for parameter in held_parameters(reduced)], a.levels.family
+                evidence.add(reduce_adjustment(part))
+    every = [parameter.joint for parameter in evidence.together(level)]
     significant = [interior for interior in every if is_significant(interior, len(every), level)]
     contradicted = sorted(significant, key=lambda interior: -interior.gain.value)
     names = []

@@ -24,7 +24,6 @@ from scipy.sparse import csr_matrix
 from scipy.sparse.csgraph import connected_components
 
 from sfm.adjustment.engine.solvers.fronts import halve
-from sfm.adjustment.result import Adjustment
 from sfm.judgement.hypotheses.alternatives import interiors
 from sfm.judgement.hypotheses.columns import interior_columns
 from sfm.judgement.hypotheses.families import HELD, Alternative
@@ -99,71 +98,111 @@ def reduced_to(
         yield part, replace(start, cameras=cameras), rows
 
 
+class _OfPart(NamedTuple):
+    """The test of one held parameter in one part."""
+
+    part: int  # its number
+    own: Alternative
+    unit: float  # of the parameter, for one unit of its column
+    slope: FloatArray  # along the column at the residuals, of each photograph, (m,)
+    curvature: FloatArray  # change of the slope by one unit of the column, (m,)
+    design_effect: float
+    image_points: int  # number of those of the part
+
+    @property
+    def change(self) -> float:
+        """Step of the parameter, in its unit."""
+        return float(self.own.gain.beta[0]) * self.unit
+
+    @property
+    def information(self) -> float:
+        """Inverse of the variance of the change."""
+        return self.own.gain.value / self.change**2
+
+    def scores(self, change: float) -> FloatArray:
+        """Return what each photograph contributes to the slope along a change, after it, (m,)."""
+        step = change / self.unit
+        return step * (self.slope + step * self.curvature)
+
+
 class SharedParameter(NamedTuple):
     """A held interior parameter, with the evidence of all parts together."""
 
     joint: Alternative  # its photographs are those of the parts, one after another
     change: float  # of the parameter, in its unit
-    of_parts: tuple[tuple[int, Alternative], ...]  # number of each part that determines it, and its own test
-
-    def step_in(self, part: Alternative, a: Adjustment) -> FloatArray:
-        """Return the change in the unit of the column of a part, (1,)."""
-        return np.array([self.change / interior_columns(a, part.parameters)[2][0]])
+    of_parts: tuple[_OfPart, ...]  # the tests of the parts that determine it
 
 
-def held_parameters(parts: Sequence[Reduced]) -> list[SharedParameter]:
-    """Return each held interior parameter with the evidence of all parts together.
+class SharedEvidence:
+    """Evidence of the parts of a network on the held interior parameters of its cameras.
 
-    Args:
-        parts: networks that have only cameras in common.
+    The parts have only cameras in common.
     """
-    of_parameter: dict[tuple[str, str], list[tuple[int, Alternative]]] = {}
-    for p, part in enumerate(parts):
+
+    def __init__(self) -> None:
+        """Start without parts."""
+        self._of_parameter: dict[tuple[str, str], list[_OfPart]] = {}
+        self._parts = 0
+
+    def add(self, part: Reduced) -> None:
+        """Add the evidence of a part."""
         cameras = part.adjustment.estimate.cameras
         for interior in interiors(part, HELD):
-            if len(interior.gain.beta) == 1:
-                index, s = interior.parameters[0]
-                of_both = cameras[index].owner_of(s), cameras[index].names[s]
-                of_parameter.setdefault(of_both, []).append((p, interior.priced(part)))
-    return [_together(parts, of_parts) for of_parts in of_parameter.values()]
+            if len(interior.gain.beta) > 1:
+                continue
+            index, s = interior.parameters[0]
+            D = interior.whitened(part)
+            left = part.absorb(D)[2][:, :, 0]
+            m = part.photographs
+            test = _OfPart(
+                self._parts,
+                interior.priced(part),
+                interior_columns(part.adjustment, interior.parameters)[2][0],
+                np.bincount(part.image, (part.v * left).sum(axis=1), minlength=m).astype(float),
+                np.bincount(part.image, (left**2).sum(axis=1), minlength=m).astype(float),
+                part.design_effect(D),
+                len(part.image),
+            )
+            owner = cameras[index].owner_of(s), cameras[index].names[s]
+            self._of_parameter.setdefault(owner, []).append(test)
+        self._parts += 1
+
+    def together(self, level: float) -> list[SharedParameter]:
+        """Return each held parameter with the evidence of all parts.
+
+        Args:
+            level: probability that parts which agree are taken for contradicting ones.
+        """
+        return [_together(tests, level) for tests in self._of_parameter.values()]
 
 
-def _together(parts: Sequence[Reduced], of_parts: Sequence[tuple[int, Alternative]]) -> SharedParameter:
+def _together(tests: Sequence[_OfPart], level: float) -> SharedParameter:
     """Return one parameter with the evidence of the parts that determine it."""
-    every = [alternative for _, alternative in of_parts]
-    units = np.array([interior_columns(parts[p].adjustment, own.parameters)[2][0] for p, own in of_parts])
-    change = np.array([own.gain.beta[0] for own in every]) * units
-    information = np.array([own.gain.value for own in every]) / change**2
+    change = np.array([test.change for test in tests])
+    information = np.array([test.information for test in tests])
     total = float(information.sum())
     mean = float(information @ change) / total
-    level = parts[0].adjustment.levels.family
     apart = float(information @ (change - mean) ** 2)
-    if len(every) > 1 and apart > chi2_isf(level, len(every) - 1):
-        spread = Spread(apart / (len(every) - 1), len(every) - 1, among=False)
-    else:
-        scores, photographs = 0.0, 0
-        for (p, own), unit in zip(of_parts, units, strict=True):
-            step = own.whitened(parts[p])[:, :, 0] * (mean / unit)
-            scores += float((parts[p].scores(step, step) ** 2).sum())
-            photographs += parts[p].photographs
-        m = max(photographs, 2)
-        spread = Spread(scores / (total * mean**2) * m / (m - 1), m - 1, among=False)
-    if len(every) == 1:
-        spread = every[0].spread
-    search = every[0].search
+    first = tests[0].own
+    if len(tests) == 1:
+        spread = first.spread
+    elif apart > chi2_isf(level, len(tests) - 1):
+        spread = Spread(apart / (len(tests) - 1), len(tests) - 1, among=False)
+    else:  # of all photographs along the common change, over that expected by chance
+        scores = np.concatenate([test.scores(mean) for test in tests])
+        m = len(scores)
+        spread = Spread(float(scores @ scores) / (total * mean**2) * m / (m - 1), m - 1, among=False)
     joint = replace(
-        every[0],
-        factor=np.concatenate([own.factor for own in every]),
-        parameters=tuple(dict.fromkeys(pair for own in every for pair in own.parameters)),
+        first,
+        factor=np.concatenate([test.own.factor for test in tests]),
+        parameters=tuple(dict.fromkeys(pair for test in tests for pair in test.own.parameters)),
         gain=Gain(total * mean**2, 1, np.array([mean])),
         spread=spread,
-        price=price_of(1, sum(len(parts[p].image) for p, _ in of_parts), search),
-        redundancy=sum(own.redundancy for own in every),
+        price=price_of(1, sum(test.image_points for test in tests), first.search),
+        redundancy=sum(test.own.redundancy for test in tests),
+        design_effect=float(information @ [test.design_effect for test in tests]) / total,
     )
-    if joint.evidence_beside_spread > 0:  # else it is not significant in any case
-        effects = [parts[p].design_effect(own.whitened(parts[p])) for p, own in of_parts]
-        joint = replace(joint, design_effect=float(information @ effects) / total)
-    return SharedParameter(joint, mean, tuple(of_parts))
+    return SharedParameter(joint, mean, tuple(tests))
 
 
 def of_all_parts(said: Sequence[Remark]) -> tuple[Remark, ...]:

@@ -16,7 +16,6 @@ from __future__ import annotations
 
 from collections import defaultdict
 from collections.abc import Iterator, Sequence
-from contextlib import suppress
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -174,7 +173,7 @@ def readjusted(plain: Adjustment, network: Network, start: Adjustment) -> Adjust
         start: start values, and which image points are rejected at first.
     """
     for method in ("gauss-newton", "levenberg-marquardt"):
-        with suppress(GeometryError):
+        try:
             adjusted = adjust(
                 network,
                 start.estimate,
@@ -190,9 +189,13 @@ def readjusted(plain: Adjustment, network: Network, start: Adjustment) -> Adjust
                     max_iterations=MAX_ITERATIONS,
                 ),
             )
-            if adjusted.converged and adjusted.redundancy >= 1:  # it may reject all but what it needs
-                return replace(adjusted, error_correlation=plain.error_correlation)  # the best known one
-    return None
+        except GeometryError:
+            return None
+        if adjusted.converged:
+            break
+    if not adjusted.converged or adjusted.redundancy < 1:  # it may reject all but what it needs
+        return None
+    return replace(adjusted, error_correlation=plain.error_correlation)  # the best known one
 
 
 def _side_by_side(every: Sequence[Alternative], a: Adjustment, columns: Columns) -> FloatArray:
