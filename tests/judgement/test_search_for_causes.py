@@ -84,7 +84,7 @@ def test_causes_are_sought_one_beside_the_other_and_are_few(
     cause = Cause(alternative(), refitted(a), ())
     known: list[int] = []
 
-    def best(plain: Adjustment, causes: tuple[Cause, ...], *, reduced: None) -> Cause:
+    def best(plain: Adjustment, causes: tuple[Cause, ...], *, reduced: Any) -> Cause:
         known.append(len(causes))
         return replace(cause, refit=refitted(a, shift=0.5 if len(causes) == 1 else 4.0))
 

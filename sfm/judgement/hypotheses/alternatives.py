@@ -410,10 +410,8 @@ def _moves(reduced: Reduced, factor: FloatArray) -> _Moves:
     points = np.flatnonzero((before >= MIN_GROUP) & (after >= MIN_GROUP))
     # the columns of a motion are those of the point in the photographs afterwards
     V, g, K = np.zeros((n, 3, 3)), np.zeros((n, 3)), np.zeros((n, 3, len(reduced.t)))
-    add_to_points(
-        *(reduced.B[on], reduced.A[on], reduced.v[on], reduced.image[on], reduced.point[on]),
-        *(reduced.photographs, V, g, K),
-    )
+    B, A, v, image, point = reduced.B[on], reduced.A[on], reduced.v[on], reduced.image[on], reduced.point[on]
+    add_to_points(B, A, v, image, point, reduced.photographs, V, g, K)
     V, g, K = V[points], g[points], K[points]
     Ct = np.swapaxes(reduced.L[points] @ V, 1, 2)
     K -= Ct @ reduced.W[points]

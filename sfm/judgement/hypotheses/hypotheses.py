@@ -323,7 +323,7 @@ def find_causes(plain: Adjustment, reduced: Reduced | None = None) -> tuple[Caus
     """
     causes: tuple[Cause, ...] = ()
     for _ in range(MAX_CAUSES):
-        cause = _best(plain, causes, reduced=None if causes else reduced)
+        cause = _best(plain, causes, reduced=causes[-1].refit.reduced if causes else reduced)
         if cause is None:
             break
         causes = _still_needed(plain, causes, cause)
@@ -348,21 +348,18 @@ def _best(
     """Return the accepted alternative, in addition to known causes, that gives the best adjustment.
 
     The alternatives with most evidence are adjusted, because the score test is linear: for a large error it
-    favours the alternative with most parameters. Those of `beside` are adjusted already. `reduced` is `plain`
-    with all unknowns eliminated, if that is known.
+    favours the alternative with most parameters. Those of `beside` are adjusted already. `reduced` is the
+    adjustment with the known causes, all unknowns eliminated, if that is known.
     """
     current = causes[-1].refit.adjustment if causes else plain
     before = [(cause.alternative, cause.refit.beta) for cause in causes]
-    reduced = (causes[-1].refit.reduced if causes else reduced) or reduce_adjustment(current)
+    reduced = reduced or reduce_adjustment(current)
     every, level = alternatives_of(reduced), plain.levels.family
     to_try = _to_adjust(every, level)
     work = max(len(to_try), 1) * len(plain.network.images) ** 3
 
     def judge(alternative: Alternative, refitted: Refit, asked: float) -> None:
-        evidence = alternative.deflated(refitted.gain, reduced.redundancy) - alternative.price
-        if causes and evidence >= asked:
-            beyond = _beyond_spread(alternative, refitted, reduced.redundancy, before)
-            evidence = min(evidence, beyond - alternative.price)
+        evidence = _evidence_of(alternative, refitted, reduced.redundancy, before, asked)
         if holding and not evidence > max(tried.evidence for tried in holding):
             refitted = replace(refitted, reduced=None)  # only that of the best is needed
         holding.append(_Adjusted(evidence, alternative, refitted))
@@ -460,6 +457,20 @@ def _with_free_shape(held: Adjustment, free: Adjustment) -> list[tuple[Alternati
         redundancy=held.redundancy,
     )
     return [(free_shape, Refit(free, beta, gain, *shifts_of(held, held, free, free_shape, beta)))]
+
+
+def _evidence_of(
+    alternative: Alternative,
+    refitted: Refit,
+    redundancy: int,
+    before: Sequence[tuple[Alternative, FloatArray]],
+    asked: float,
+) -> float:
+    """Return the evidence of an adjusted alternative beside known causes, to the last where it is `asked`."""
+    evidence = alternative.deflated(refitted.gain, redundancy) - alternative.price
+    if not before or evidence < asked:
+        return evidence
+    return min(evidence, _beyond_spread(alternative, refitted, redundancy, before) - alternative.price)
 
 
 def _beyond_spread(

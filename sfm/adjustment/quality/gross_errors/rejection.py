@@ -326,7 +326,12 @@ def _snoop_all(run: Run, optimum: Optimum, weight: FloatArray, alpha: float) -> 
             redundancy = min(max(of_image_points, 1.0), redundancy)
         seen, used = layout.observations, weight > 0
         out = snoop(
-            *(seen, optimum.state, v, complement, Q.limiting, used),
+            seen,
+            optimum.state,
+            v,
+            complement,
+            Q.limiting,
+            used,
             sigma0=max(np.sqrt(vPv / max(redundancy, 1)), rounding_of(seen)),
             critical=tau_critical(alpha, redundancy),
         )
