@@ -177,9 +177,7 @@ def errors_before(
 
 def joint_distance(errors: FloatArray, covariance: FloatArray) -> float:
     """Return the squared Mahalanobis distance of errors, (m, 6), per degree of freedom."""
-    scale = np.sqrt(
-        np.diagonal(covariance)
-    )  # lengths and angles have the same weight when rank is determined
+    scale = np.sqrt(np.diagonal(covariance))  # lengths and angles have the same weight in the rank
     inverse = np.linalg.pinv(covariance / np.outer(scale, scale), rcond=1e-10, hermitian=True)
     z = errors.ravel() / scale
     return float(z @ inverse @ z) / (errors.size - 7)

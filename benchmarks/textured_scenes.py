@@ -166,12 +166,12 @@ def _nearby_meeting(
         length[k] = t
 
 
-def scene_texture(scene: TexturedScene, finer: float = 1.0) -> tuple[AnyArray, float]:
+def scene_texture(scene: TexturedScene) -> tuple[AnyArray, float]:
     """Return the reflectance of the surface with the origin in its middle, and the side of a texel, m."""
     if scene.layout == "dome":
         return render.texture(), render.TEXEL_M
     reach = np.abs(scene.position[:, :2]).max(axis=0) + DISTANCE_M
-    texel = render.TEXEL_M / finer
+    texel = render.TEXEL_M * scene.camera.pixel_mm[0] / PIXEL_MM
     return render.texture(size_m=(2 * float(reach[0]), 2 * float(reach[1])), texel_m=texel), texel
 
 
@@ -228,7 +228,7 @@ def render_scene(
     """Write the photographs and a survey file; return the scene."""
     folder.mkdir(parents=True, exist_ok=True)
     scene = textured_scene(roughness, photographs, finer, layout)
-    skin, texel = scene_texture(scene, finer)
+    skin, texel = scene_texture(scene)
     for index in range(photographs):
         noise = np.random.default_rng((render.SEED, index)).normal(
             0, render.NOISE, scene.camera.size_px[::-1]

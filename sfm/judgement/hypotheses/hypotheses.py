@@ -29,7 +29,7 @@ from sfm.judgement.hypotheses.alternatives import (
     cameras_of_photographs,
     is_significant,
 )
-from sfm.judgement.hypotheses.columns import columns_of
+from sfm.judgement.hypotheses.columns import columns_of, interior_columns
 from sfm.judgement.hypotheses.families import HELD, MOVED, Alternative, InteriorFamily, PointFamily
 from sfm.judgement.hypotheses.parts import SharedEvidence, of_all_parts, parts_of, reduced_to
 from sfm.judgement.hypotheses.refit import (
@@ -215,7 +215,7 @@ def _shared_by_parts(
     clearest = max(shared.of_parts, key=lambda test: test.own.gain.value)
     plain, own = solved[clearest.part], clearest.own
     beta, seen = np.array([shared.change / clearest.unit]), plain.network.image_points
-    with_it = replace(seen, xy=seen.xy - own.columns(plain, columns_of(plain)) @ beta)
+    with_it = replace(seen, xy=seen.xy - interior_columns(plain, own.parameters)[0] @ beta)
     refitted = readjusted(plain, replace(plain.network, image_points=with_it), plain)
     if refitted is None:
         return []

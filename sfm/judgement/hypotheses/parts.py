@@ -128,9 +128,13 @@ class _OfPart(NamedTuple):
 class SharedParameter(NamedTuple):
     """A held interior parameter, with the evidence of all parts together."""
 
-    joint: Alternative  # its photographs are those of the parts, one after another
-    change: float  # of the parameter, in its unit
+    joint: Alternative  # its photographs are those of the parts, one after another; its step is in its unit
     of_parts: tuple[_OfPart, ...]  # the tests of the parts that determine it
+
+    @property
+    def change(self) -> float:
+        """Change of the parameter, in its unit."""
+        return float(self.joint.gain.beta[0])
 
 
 class SharedEvidence:
@@ -151,13 +155,14 @@ class SharedEvidence:
             if len(interior.gain.beta) > 1:
                 continue
             index, s = interior.parameters[0]
-            D = interior.whitened(part)
+            columns, _, (unit,) = interior_columns(part.adjustment, interior.parameters)
+            D = part.whiten(columns)
             left = part.absorb(D)[2][:, :, 0]
             m = part.photographs
             test = _OfPart(
                 self._parts,
                 interior.priced(part),
-                interior_columns(part.adjustment, interior.parameters)[2][0],
+                unit,
                 np.bincount(part.image, (part.v * left).sum(axis=1), minlength=m).astype(float),
                 np.bincount(part.image, (left**2).sum(axis=1), minlength=m).astype(float),
                 part.design_effect(D),
@@ -202,7 +207,7 @@ def _together(tests: Sequence[_OfPart], level: float) -> SharedParameter:
         redundancy=sum(test.own.redundancy for test in tests),
         design_effect=float(information @ [test.design_effect for test in tests]) / total,
     )
-    return SharedParameter(joint, mean, tuple(tests))
+    return SharedParameter(joint, tuple(tests))
 
 
 def of_all_parts(said: Sequence[Remark]) -> tuple[Remark, ...]:
