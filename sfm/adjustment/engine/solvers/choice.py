@@ -16,12 +16,13 @@ from scipy.sparse import csr_matrix
 
 from sfm.adjustment.engine.collinearity import Observations
 from sfm.adjustment.engine.observed import ObservedKind, coupled_poses
+from sfm.adjustment.engine.solvers import protocol
 from sfm.adjustment.engine.solvers.dense import DenseSolver
 from sfm.adjustment.engine.solvers.fronts import BYTES, fronts_of, pairs_of
 from sfm.adjustment.engine.solvers.helmert import HelmertSolver
 from sfm.adjustment.engine.solvers.multifrontal import MultifrontalSolver
 from sfm.adjustment.engine.solvers.partition import partition_of
-from sfm.adjustment.engine.solvers.protocol import Solver, available_bytes, refuse_what_does_not_fit
+from sfm.adjustment.engine.solvers.protocol import Solver
 from sfm.adjustment.engine.unknowns import Unknowns
 from sfm.model.conventions import AnyArray, IntArray
 from sfm.model.display import counted
@@ -62,7 +63,7 @@ def choose_solver(layout: Unknowns) -> Solver:
     product = 3.0 * len(rays) * layout.reduced**2 / PRODUCT_RATE
     full = min(summed, product) + layout.reduced**3 / 3.0 / FACTOR_RATE
 
-    fits = DenseSolver(layout).bytes <= available_bytes()
+    fits = DenseSolver(layout).bytes <= protocol.available_bytes()
 
     def dense() -> DenseSolver:
         return DenseSolver(layout, pairs_of(observations) if summed < product else None)
@@ -117,15 +118,15 @@ def refuse_too_large(network: Network) -> None:
         GeometryError: most photographs share points, and their normal equations do not fit in memory.
     """
     m = len(network.images)
-    size, limit = 3 * BYTES * (6.0 * m) ** 2, available_bytes()  # factor, its inverse, their product
-    if size <= limit:
+    size = 3 * BYTES * (6.0 * m) ** 2  # factor, its inverse, their product
+    if size <= protocol.available_bytes():
         return
     sees = network.incidence(np.ones(len(network.image_points), dtype=bool))
     step = np.arange(TRIED_PAIRS)
     first = step * m // TRIED_PAIRS
     second = (first + 1 + step * 7919 % (m - 1)) % m  # from neighbours to far apart in the sequence
     if (sees[first].multiply(sees[second]).sum(axis=1) > 0).mean() > MOSTLY:
-        refuse_what_does_not_fit(size, f"{counted(6 * m, 'unknown')} that are all connected", limit=limit)
+        protocol.refuse_what_does_not_fit(size, f"{counted(6 * m, 'unknown')} that are all connected")
 
 
 @compiled

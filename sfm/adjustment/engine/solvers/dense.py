@@ -17,7 +17,6 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 from dataclasses import dataclass
-from functools import cached_property
 
 import numpy as np
 from scipy.linalg import eigh
@@ -73,11 +72,6 @@ class DenseSolver:
         # S, a product and rows; or factor, its inverse, their product, and rows and products of both halves
         return BYTES * max(2 * matrix + rows, 3 * matrix + 4 * half)
 
-    @cached_property
-    def limit(self) -> float:
-        """Memory that may be used, bytes; determined once in an adjustment because it is read from files."""
-        return protocol.available_bytes()
-
     def factor(
         self, equations: Equations, motions: Motions, *, damped: bool = False, coarse: bool = False
     ) -> DenseFactor | None:
@@ -87,7 +81,7 @@ class DenseSolver:
             GeometryError: the matrix would not fit in memory.
         """
         protocol.refuse_what_does_not_fit(
-            self.bytes, f"{counted(self.layout.reduced, 'unknown')} that are all connected", limit=self.limit
+            self.bytes, f"{counted(self.layout.reduced, 'unknown')} that are all connected"
         )
         scale = equations.parts.scale
         S = schur_complement(equations, self.layout, self.pairs, single=coarse)

@@ -85,11 +85,6 @@ class HelmertSolver:
         """Peak memory of the interface in this process, bytes."""
         return COPIES * BYTES * len(self.partition.columns) ** 2
 
-    @cached_property
-    def limit(self) -> float:
-        """Memory that may be used, bytes."""
-        return protocol.available_bytes()
-
     @property
     def pieces(self) -> tuple[Piece, ...]:
         """The blocks."""
@@ -172,7 +167,6 @@ class HelmertSolver:
         protocol.refuse_what_does_not_fit(
             self.bytes,
             f"{counted(len(self.partition.columns), 'unknown')} at the interface",
-            limit=self.limit,
         )
 
         def factor_with(added: FloatArray) -> HelmertFactor | None:

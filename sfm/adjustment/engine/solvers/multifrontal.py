@@ -25,7 +25,6 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass
-from functools import cached_property
 from typing import NamedTuple, Protocol, Self, TypeVar
 
 import numpy as np
@@ -78,11 +77,6 @@ class MultifrontalSolver:
         layout = self.layout
         return self.fronts.bytes(layout.reduced - layout.pose_free.size, search_bytes(layout))
 
-    @cached_property
-    def limit(self) -> float:
-        """Memory that may be used, bytes; determined once in an adjustment because it is read from files."""
-        return protocol.available_bytes()
-
     def factor(
         self, equations: Equations, motions: Motions, *, damped: bool = False, coarse: bool = False
     ) -> MultifrontalFactor | None:
@@ -92,7 +86,7 @@ class MultifrontalSolver:
             GeometryError: the factor would not fit in memory.
         """
         protocol.refuse_what_does_not_fit(
-            self.bytes, f"the unknowns of {len(self.layout.pose_free)} photographs", limit=self.limit
+            self.bytes, f"the unknowns of {len(self.layout.pose_free)} photographs"
         )
         first = self.layout.pose_free.size
         border = border_of(equations, equations.scale[:first], equations.scale[first:])

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
+from functools import cache
 from typing import Any, Protocol
 
 from sfm.adjustment.datum import Motions
@@ -75,23 +76,24 @@ class Solver(Protocol):
         """
 
 
+@cache
 def available_bytes() -> float:
-    """Return the memory that normal equations may use, bytes."""
+    """Return the memory that normal equations may use, bytes; determined once, as it is read from files."""
     known = limit_bytes()
     return SHARE * (known if math.isfinite(known) else UNKNOWN)
 
 
-def refuse_what_does_not_fit(size: float, unknowns: str, *, limit: float) -> None:
+def refuse_what_does_not_fit(size: float, unknowns: str) -> None:
     """Refuse normal equations that need more memory than is available.
 
     Args:
         size: memory of the equations, their factor and its inverse, bytes.
         unknowns: description of the unknowns, for the message.
-        limit: memory that may be used, bytes, see `available_bytes`.
 
     Raises:
         GeometryError: they need more.
     """
+    limit = available_bytes()
     if size > limit:
         raise GeometryError(
             f"adjustment: {unknowns} need {size / 1e9:.0f} GB when they are factored and inverted, the "
