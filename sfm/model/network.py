@@ -198,6 +198,11 @@ class Network:
         return frozenset(self.points) - {self.points[j] for j in others.tolist()}
 
     @cached_property
+    def rows_by_photograph(self) -> dict[str, IntArray]:
+        """Rows of the image points of each photograph, in order, by its name."""
+        return dict(zip(self.images, rows_of(self.image_points.image, len(self.images)), strict=True))
+
+    @cached_property
     def named(self) -> BoolArray:
         """Which points keep their names in later runs, (n,)."""
         lasting = np.array([source.names_last for source in self.sources])[self.source]

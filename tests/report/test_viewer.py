@@ -15,8 +15,8 @@ import cv2
 import numpy as np
 import pytest
 
-from sfm.model.solution import Solution
-from sfm.report.viewer.embedded import packed_scene, scene_of_stored, sources
+from sfm.model.solution import SeenTargets, Solution
+from sfm.report.viewer.embedded import joined_targets, packed_scene, scene_of_stored, sources
 from sfm.report.viewer.pictures import Pictures, cut_pictures
 from tests.places import ROOT
 from tests.synthetic import SIZE_PX, make_network, seed_of
@@ -55,6 +55,25 @@ def test_locked_packages_name_no_host() -> None:
 def stored(name: str) -> Solution:
     network, truth = make_network(seed_of(name), images=6, points=40, noise_px=0.1)
     return Solution(name, network, truth)
+
+
+def test_each_image_point_has_the_outline_of_its_target() -> None:
+    """In three photographs, of which the second has no image point and the third has two candidates."""
+    rng = np.random.default_rng(seed_of("outlines of targets"))
+    photo = rng.permutation(np.repeat([0, 2], 20))
+    xy = rng.uniform(0, 1000, (40, 2))
+    order = rng.permutation(40)
+    outline = np.column_stack([rng.uniform(2, 9, (40, 2)), np.zeros(40)])
+    seen = SeenTargets(
+        np.concatenate([photo[order], [1, 2, 2]]),
+        np.vstack([xy[order], xy[:3]]),  # at an image point, but of another photograph or rejected
+        np.vstack([outline[order], np.ones((1, 3)), np.full((2, 3), np.nan)]),
+        ("",) * 41 + ("too small",) * 2,
+    )
+    ellipse, marks = joined_targets(seen, photo, xy)
+    np.testing.assert_array_equal(ellipse, outline)
+    assert marks.photo.tolist() == [1, 2, 2]
+    assert [marks.reasons[k] for k in marks.reason[1:]] == ["too small"] * 2
 
 
 def unpacked(text: str) -> tuple[dict[str, object], bytes]:

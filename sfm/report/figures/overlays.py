@@ -154,8 +154,7 @@ def draw_photograph(
 
     adjustment = solved if isinstance(solved, Adjustment) else None
     network = solved.network if isinstance(solved, Adjustment) else solved
-    i = network.images.index(photograph.image) if photograph.image in network.images else -1
-    rows = np.flatnonzero(network.image_points.image == i)
+    rows = network.rows_by_photograph.get(photograph.image, np.zeros(0, dtype=np.int64))
     seen, points = network.image_points.xy[rows], network.image_points.point[rows]
     rejected = np.zeros(len(rows), dtype=bool) if adjustment is None else adjustment.rejected[rows]
     colour = [DROPPED if dropped else USED for dropped in rejected]

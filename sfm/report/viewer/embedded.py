@@ -27,7 +27,7 @@ from markupsafe import Markup
 from sfm.files.plain_text import or_none
 from sfm.judgement.survey_result import sort_likeliest_first
 from sfm.model.conventions import AnyArray, BoolArray, FloatArray, IntArray, angles_from_rotation
-from sfm.model.network import ScaleBars
+from sfm.model.network import ScaleBars, rows_of
 from sfm.model.solution import MAX_POINTS, SeenTargets, Solution
 from sfm.orientation.image_rays import image_residuals, ray_angles
 from sfm.report.figures.overlays import nearest_image_points
@@ -329,9 +329,11 @@ def joined_targets(seen: SeenTargets, image: IntArray, xy: FloatArray) -> tuple[
     """
     ellipse = np.full((len(xy), 3), np.nan)
     left = np.ones(len(seen.image), dtype=bool)
-    for i in np.unique(seen.image).tolist():
-        rows = np.flatnonzero(image == i)
-        measured = np.flatnonzero((seen.image == i) & seen.measured)
+    of_targets = np.flatnonzero(seen.measured)
+    count = 1 + int(max(seen.image.max(initial=-1), image.max(initial=-1)))
+    by_photograph = zip(rows_of(image, count), rows_of(seen.image[of_targets], count), strict=True)
+    for rows, at in by_photograph:
+        measured = of_targets[at]
         used = nearest_image_points(seen.xy[measured], xy[rows])
         ellipse[rows[used[used >= 0]]] = seen.ellipse[measured[used >= 0]]
         left[measured[used >= 0]] = False
