@@ -36,6 +36,7 @@ from sfm.model.camera import Camera
 from sfm.model.conventions import FloatArray
 from sfm.model.display import counted
 from sfm.model.errors import SurveyFileError
+from sfm.model.network import rows_of
 
 CAMERA, POSE = "AutoCal*.xml", "Orientation-*.xml"
 CONTROL, MEASURED = "MesuresAppuis.xml", "MesuresIm.xml"
@@ -157,9 +158,9 @@ def write_micmac(folder: Path, content: Content) -> None:
         _write(folder / CONTROL, "DicoAppuisFlottant", lines)
     seen = network.image_points
     lines = []
-    for i, image in enumerate(images):
+    for image, of_image in zip(images, rows_of(seen.image, len(network.images)), strict=True):
         lines += ["<MesureAppuiFlottant1Im>", f"<NameIm>{escape(image)}</NameIm>"]
-        for row in np.flatnonzero(seen.image == i).tolist():
+        for row in of_image.tolist():
             point = escape(network.points[seen.point[row]])
             lines.append(
                 f"<OneMesureAF1I><NamePt>{point}</NamePt><PtIm>{_text(seen.xy[row])}</PtIm></OneMesureAF1I>"

@@ -166,12 +166,10 @@ def _middles(stated: StatedModel, lenses: FloatArray, xy: FloatArray, image: Int
     usable = np.isfinite(away).all(axis=1) & (P[:, 2] > 0)
     if not usable.any():
         raise stated.error("no point is in front of a photograph, which the middle of photographs is from")
-    every = np.median(away[usable], axis=0)
+    away, image = away[usable], image[usable]
+    every = np.median(away, axis=0)
     middle = np.array(
-        [
-            np.median(away[rows], axis=0) if len(rows) else every
-            for rows in (np.flatnonzero(usable & (image == i)) for i in range(len(stated.images)))
-        ]
+        [np.median(away[rows], axis=0) if len(rows) else every for rows in rows_of(image, len(stated.images))]
     )
     middle = np.round(2 * middle) / 2
     if not ((middle >= 0.5) & (2 * middle <= MAX_SIDE_PX)).all():

@@ -21,6 +21,7 @@ import numpy as np
 from sfm.files.globs import why_no_folder
 from sfm.model.conventions import AnyArray, BoolArray, FloatArray, IntArray
 from sfm.model.errors import PhotographError, SurveyFileError
+from sfm.model.network import rows_of
 from sfm.photographs.exif import read_metadata
 from sfm.photographs.reading import read_mask
 from sfm.runtime.sampling import is_shown
@@ -95,9 +96,9 @@ class Masks:
             PhotographError: a mask cannot be read.
         """
         visible = np.ones(len(xy), dtype=bool)
-        for i in np.unique(image).tolist() if self.folder is not None else ():
-            rows = np.flatnonzero(image == i)
-            visible[rows] = self.visible(names[i], xy[rows], sizes_px[i])
+        for i, rows in enumerate(rows_of(image, len(names))) if self.folder is not None else ():
+            if len(rows):
+                visible[rows] = self.visible(names[i], xy[rows], sizes_px[i])
         return visible
 
     def black(self, name: str, size_px: tuple[int, int]) -> BoolArray | None:

@@ -14,7 +14,7 @@ from sfm.matching.tracks.correspondence import match_targets
 from sfm.model.camera import project
 from sfm.model.conventions import FloatArray, IntArray
 from sfm.model.estimate import Estimate
-from sfm.model.network import ImagePoints, Network, ScaleBars
+from sfm.model.network import ImagePoints, Network, ScaleBars, rows_of
 from sfm.runtime.progress import SILENT, Progress
 from sfm.survey.diagnosis.codes_found import missing_plates, sides_not_found, small_codes
 from sfm.survey.inputs.given_values import ScaleBar
@@ -196,8 +196,7 @@ def match_uncoded(
             2 * targets.semi_axes[rows, 0] for targets, rows in zip(photographs.targets, free, strict=True)
         ],
     )
-    for i, rows in enumerate(free):
-        of_image = matches.image == i
+    for i, (rows, of_image) in enumerate(zip(free, rows_of(matches.image, len(free)), strict=True)):
         point[i][rows[matches.target[of_image]]] = len(coded) + matches.point[of_image]
     uncoded = len(matches.points)
     return (

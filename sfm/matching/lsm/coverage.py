@@ -92,9 +92,9 @@ class CoveredPixels:
     def free_positions(self, image: IntArray, xy: FloatArray) -> BoolArray:
         """Return which positions, given by photograph (k,) and xy (px, (k, 2)), are on free pixels, (k,)."""
         free = np.ones(len(xy), dtype=bool)
-        for i in np.unique(image).tolist():
-            rows = np.flatnonzero(image == i)
-            free[rows] = self.is_free(i, xy[rows], 0.0)
+        for i, rows in enumerate(rows_of(image, len(self.shapes))):
+            if len(rows):
+                free[rows] = self.is_free(i, xy[rows], 0.0)
         return free
 
 
