@@ -12,10 +12,13 @@ Schoenberger (2024), Global Structure-from-Motion revisited, ECCV; the pipelines
 
 from __future__ import annotations
 
+import shutil
 import time
-from collections.abc import Iterable
-from dataclasses import dataclass
+from collections.abc import Iterable, Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass, replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 from PIL import ExifTags, Image
@@ -52,7 +55,6 @@ def map_photographs(
     cameras: tuple[tuple[str, ...], ...],
     *,
     at_once: bool = False,
-    pairs: Iterable[tuple[str, str]] | None = None,
     threads: int = -1,
 ) -> MapperBaseline:
     """Run COLMAP's pipeline on photographs and return its largest model.
@@ -61,65 +63,114 @@ def map_photographs(
         folder: folder of the photographs.
         cameras: for each camera the names of its photographs, relative to the folder.
         at_once: whether all photographs are oriented together, by the global mapper, instead of one by one.
-        pairs: names, without spaces, of the photographs that are compared; all with each other if not given.
         threads: threads of COLMAP; -1 uses all cores.
 
     Raises:
         BackendError: pycolmap is missing, cannot read a photograph, or finds no model.
     """
+    begun = time.perf_counter()
+    with scratch_folder() as work:
+        database = work / "scene.db"
+        match_photographs(folder, cameras, database, threads=threads)
+        mapped = map_matches(folder, database, at_once=at_once, threads=threads)
+    return replace(mapped, seconds=time.perf_counter() - begun)
+
+
+def match_photographs(
+    folder: Path,
+    cameras: tuple[tuple[str, ...], ...],
+    database: Path,
+    *,
+    pairs: Iterable[tuple[str, str]] | None = None,
+    threads: int = -1,
+) -> None:
+    """Write COLMAP's features of photographs, and their matches, into a new database.
+
+    Args:
+        folder: folder of the photographs.
+        cameras: for each camera the names of its photographs, relative to the folder.
+        database: file to write.
+        pairs: names, without spaces, of the photographs that are compared; all with each other if not given.
+        threads: threads of COLMAP; -1 uses all cores.
+
+    Raises:
+        BackendError: pycolmap is missing, or cannot read a photograph.
+    """
+    pycolmap = load_pycolmap()
+    with _reported(pycolmap):
+        extraction = pycolmap.FeatureExtractionOptions()
+        matching = pycolmap.FeatureMatchingOptions()
+        reader = pycolmap.ImageReaderOptions()
+        reader.camera_model = MODEL
+        extraction.num_threads = matching.num_threads = threads
+        extraction.use_gpu = matching.use_gpu = False
+        for names in cameras:
+            pycolmap.extract_features(
+                database,
+                folder,
+                image_names=list(names),
+                camera_mode=pycolmap.CameraMode.SINGLE,
+                reader_options=reader,
+                extraction_options=extraction,
+            )
+        if pairs is None:
+            pycolmap.match_exhaustive(database, matching_options=matching)
+            return
+        listed = pycolmap.ImportedPairingOptions()
+        listed.match_list_path = database.with_suffix(".txt")
+        text = "".join(f"{first} {second}\n" for first, second in pairs)
+        listed.match_list_path.write_text(text, encoding="utf-8")
+        pycolmap.match_image_pairs(database, matching_options=matching, pairing_options=listed)
+
+
+def map_matches(folder: Path, database: Path, *, at_once: bool = False, threads: int = -1) -> MapperBaseline:
+    """Run one of COLMAP's mappers on the photographs of a database and return its largest model.
+
+    Args:
+        folder: folder of the photographs.
+        database: file of `match_photographs`, which is not changed.
+        at_once: whether all photographs are oriented together, by the global mapper, instead of one by one.
+        threads: threads of COLMAP; -1 uses all cores.
+
+    Raises:
+        BackendError: pycolmap is missing, or finds no model.
+    """
     pycolmap = load_pycolmap()
     begun = time.perf_counter()
-    try:
-        with scratch_folder() as work, quiet(pycolmap):
-            pycolmap.set_random_seed(RANDOM_SEED)
-            database = work / "scene.db"
-            extraction = pycolmap.FeatureExtractionOptions()
-            matching = pycolmap.FeatureMatchingOptions()
-            reader = pycolmap.ImageReaderOptions()
-            reader.camera_model = MODEL
-            mapping = pycolmap.global_mapping if at_once else pycolmap.incremental_mapping
-            pipeline = pycolmap.GlobalPipelineOptions() if at_once else pycolmap.IncrementalPipelineOptions()
-            extraction.num_threads = matching.num_threads = pipeline.num_threads = threads
-            extraction.use_gpu = matching.use_gpu = False
-            for names in cameras:
-                pycolmap.extract_features(
-                    database,
-                    folder,
-                    image_names=list(names),
-                    camera_mode=pycolmap.CameraMode.SINGLE,
-                    reader_options=reader,
-                    extraction_options=extraction,
-                )
-            if pairs is None:
-                pycolmap.match_exhaustive(database, matching_options=matching)
-            else:
-                listed = pycolmap.ImportedPairingOptions()
-                listed.match_list_path = work / "pairs.txt"
-                text = "".join(f"{first} {second}\n" for first, second in pairs)
-                listed.match_list_path.write_text(text, encoding="utf-8")
-                pycolmap.match_image_pairs(database, matching_options=matching, pairing_options=listed)
-            models = mapping(database, folder, work, pipeline)
-            if not models:
-                raise BackendError("COLMAP's mapper found no model: too few matches between the photographs")
-            best = max(models.values(), key=lambda scene: scene.num_reg_images())
-            (work / "best").mkdir()
-            best.write_binary(str(work / "best"))
-            network, estimate = read_model(work / "best")
-    except (RuntimeError, ValueError, OSError) as error:
-        raise BackendError(f"COLMAP's mapper failed: {one_line(error)}") from error
+    with scratch_folder() as work, _reported(pycolmap):
+        own = work / "scene.db"
+        shutil.copyfile(database, own)
+        mapping = pycolmap.global_mapping if at_once else pycolmap.incremental_mapping
+        pipeline = pycolmap.GlobalPipelineOptions() if at_once else pycolmap.IncrementalPipelineOptions()
+        pipeline.num_threads = threads
+        models = mapping(own, folder, work, pipeline)
+        if not models:
+            raise BackendError("COLMAP's mapper found no model: too few matches between the photographs")
+        best = max(models.values(), key=lambda scene: scene.num_reg_images())
+        (work / "best").mkdir()
+        best.write_binary(str(work / "best"))
+        network, estimate = read_model(work / "best")
+        with pycolmap.Database.open(str(own)) as opened:
+            total = int(opened.num_images())
     seen = network.image_points
     squares = []
     for i, rows in enumerate(rows_of(seen.image, len(network.images))):
         camera = estimate.cameras[network.camera[i]]
         xy = project(camera, estimate.position[i], estimate.rotation[i], estimate.points[seen.point[rows]])
         squares.append(((xy - seen.xy[rows]) ** 2).ravel())
-    return MapperBaseline(
-        network,
-        estimate,
-        sum(len(names) for names in cameras),
-        float(np.sqrt(np.nanmean(np.concatenate(squares)))),
-        time.perf_counter() - begun,
-    )
+    rms_px = float(np.sqrt(np.nanmean(np.concatenate(squares))))
+    return MapperBaseline(network, estimate, total, rms_px, time.perf_counter() - begun)
+
+
+@contextmanager
+def _reported(pycolmap: Any) -> Iterator[None]:
+    """Silence COLMAP, seed its random numbers, and raise its errors as `BackendError`."""
+    try:
+        with quiet(pycolmap):
+            pycolmap.set_random_seed(RANDOM_SEED)
+            yield
+    except (RuntimeError, ValueError, OSError) as error:
+        raise BackendError(f"COLMAP's mapper failed: {one_line(error)}") from error
 
 
 def sensor_width_mm(make: str, model: str) -> float | None:
