@@ -34,7 +34,7 @@ GROWTH = {
     "targets": (1.0, 1.0, 0.0),
     "tie points": (1.0, 0.5, 0.0),
     "matching": (1.0, 0.5, 0.0),
-    "report": (0.8, 0.5, 0.15),
+    "report": (1.0, 0.5, 0.15),
     "adjustment": (1.0, 0.0, 0.6),
     "comparison": (1.0, 0.0, 0.6),
 }
