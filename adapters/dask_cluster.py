@@ -369,29 +369,32 @@ class DaskEngine:
                 for call in calls
             ]
 
-    def fetch(self, calls: Iterable[Call]) -> list[Any]:
-        """Return the results of calls, see sfm.runtime.executor.Keeper.
+    def each(self, calls: Iterable[Call]) -> Iterator[tuple[int, Any]]:
+        """Yield the number and the result of each call as they end, see sfm.runtime.executor.Keeper.
 
         Raises:
             BackendError: the scheduler or all workers are gone, workers died repeatedly, or lack Kolinear.
             KolinearError: an error raised by a called function.
         """
+        futures = self._start(_in_one_thread, calls)
+        done: queue.SimpleQueue[int] = queue.SimpleQueue()
+        for number, future in enumerate(futures):
+            future.add_done_callback(lambda _, number=number: done.put(number))
+        someone, left = time.monotonic(), len(futures)
         try:
-            futures = self._start(_in_one_thread, calls)
-            done: queue.SimpleQueue[None] = queue.SimpleQueue()
-            for future in futures:
-                future.add_done_callback(lambda _: done.put(None))
-            someone, left = time.monotonic(), len(futures)
             while left:
                 # not Dask's `wait`: its TimeoutError keeps what the calls took until Python finds the cycle
                 try:
-                    done.get(timeout=LOOK_SECONDS)
-                    someone, left = time.monotonic(), left - 1
+                    number = done.get(timeout=LOOK_SECONDS)
                 except queue.Empty:
                     someone = self._last_seen(someone, ADJUSTMENT_AGAIN)
+                else:
+                    someone, left = time.monotonic(), left - 1
+                    result = futures[number].result()
+                    futures[number].release()  # its worker need not hold it any longer
+                    yield number, result
                 for worker in self._lost_workers():
                     self.say(f"worker {worker} was lost; the others compute its blocks again")
-            return list(self.client.gather(futures))
         except CancelledError as error:
             raise BackendError(
                 f"the Dask scheduler is gone or has dropped the work; {ADJUSTMENT_AGAIN}"
@@ -404,6 +407,15 @@ class DaskEngine:
             raise BackendError(
                 f"the workers of the cluster lack what Kolinear needs: {_line(error)}"
             ) from error
+
+    def fetch(self, calls: Iterable[Call]) -> list[Any]:
+        """Return the results of calls in their order, see `each`.
+
+        Raises:
+            BackendError: see `each`.
+            KolinearError: see `each`.
+        """
+        return [result for _, result in sorted(self.each(calls), key=lambda ended: ended[0])]
 
     def _lost_workers(self) -> Iterator[str]:
         """Yield the workers that were lost since the last look."""

@@ -108,6 +108,13 @@ class Keeper(Protocol):
             calls: functions without side effects, and their arguments.
         """
 
+    def each(self, calls: Iterable[Call]) -> Iterator[tuple[int, Any]]:
+        """Yield the number and the result of each call, as they end.
+
+        Raises:
+            BackendError: the processes are gone, or died repeatedly.
+        """
+
     def fetch(self, calls: Iterable[Call]) -> list[Any]:
         """Return the results of calls, in order.
 
@@ -124,6 +131,11 @@ class KeptHere:
     def keep(self, calls: Iterable[Call]) -> list[Any]:
         """Return the results of calls, see `Keeper.keep`."""
         return [call.function(*call.arguments) for call in calls]
+
+    def each(self, calls: Iterable[Call]) -> Iterator[tuple[int, Any]]:
+        """Yield the results of calls, see `Keeper.each`."""
+        for number, call in enumerate(calls):
+            yield number, call.function(*call.arguments)
 
     def fetch(self, calls: Iterable[Call]) -> list[Any]:
         """Return the results of calls, see `Keeper.fetch`."""

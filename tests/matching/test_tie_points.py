@@ -29,9 +29,8 @@ from sfm.matching.lsm.coverage import (
 from sfm.matching.lsm.surface_planes import Planes, planes_at, tilted_planes
 from sfm.matching.lsm.two_photo import LsmSettings, match_lsm
 from sfm.matching.radiometry import GreyPhotographs, grey_of
-from sfm.matching.tracks import feature_tracks, interest
+from sfm.matching.tracks import interest, matched_pairs
 from sfm.matching.tracks.feature_tracks import (
-    Matches,
     TrackSettings,
     _needed,
     _snapped,
@@ -46,6 +45,7 @@ from sfm.matching.tracks.interest import (
     squares_side_by_side,
     textured_pixels,
 )
+from sfm.matching.tracks.matched_pairs import MatchedPairs
 from sfm.model.camera import Camera, project, tangents_from_pixel
 from sfm.model.conventions import (
     AnyArray,
@@ -392,11 +392,11 @@ def test_pairs_whose_matches_are_known_are_not_matched_again(monkeypatch: pytest
         matched.append((len(a), len(b)))
         return matched_features(a, b, seed=seed)
 
-    monkeypatch.setattr(feature_tracks, "matched_features", match)
-    known: Matches = {}
+    monkeypatch.setattr(matched_pairs, "matched_features", match)
+    known = MatchedPairs()
     first = link_features(natural, known=known)
-    assert len(matched) == 3 and sorted(known) == [(0, 1), (0, 2), (1, 2)]
-    del known[0, 2], known[1, 2]
+    assert len(matched) == 3 and sorted(known.known) == [(0, 1), (0, 2), (1, 2)]
+    known.forget({2})
     second = link_features(natural, known=known)
     assert len(matched) == 5 and (first.feature == second.feature).all()
 

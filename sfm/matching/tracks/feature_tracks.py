@@ -23,11 +23,10 @@ from sfm.matching.tracks.features import (
     EPIPOLAR_PX,
     MIN_PAIR_MATCHES,
     Features,
-    PairMatches,
     TwoMotions,
-    matched_features,
 )
 from sfm.matching.tracks.interest import NaturalPoints
+from sfm.matching.tracks.matched_pairs import MatchedPairs, Matches
 from sfm.matching.tracks.overlap import (
     compare_parts,
     compare_photographs,
@@ -46,9 +45,6 @@ from sfm.runtime.threads import in_threads
 
 WINDOW_PX = 15  # larger windows are less noisy, but over them an affine warp cannot follow a curved surface
 SNAP_PX = 6.0  # an interest point this close to a feature replaces its position
-
-
-Matches = dict[tuple[int, int], PairMatches]  # of pairs of photographs
 
 
 @dataclass(frozen=True)
@@ -95,7 +91,7 @@ def find_tie_points(
     *,
     seed: int = 0,
     threads: int = 1,
-    known: Matches | None = None,
+    known: MatchedPairs | None = None,
     neighbours: Sequence[IntArray] = (),
 ) -> TiePoints:
     """Find and measure points common to several photographs, without any knowledge of their orientation.
@@ -156,7 +152,7 @@ def link_features(
     min_rays: int = 3,
     seed: int = 0,
     threads: int = 1,
-    known: Matches | None = None,
+    known: MatchedPairs | None = None,
     neighbours: Sequence[IntArray] = (),
 ) -> Tracks:
     """Match the features of overlapping photographs and combine the features that belong to one point.
@@ -172,10 +168,10 @@ def link_features(
         min_rays: fewest photographs per point.
         seed: seed of the random samples.
         threads: number of pairs compared and matched at the same time.
-        known: matches of pairs of photographs that need not be matched again; new matches are added to it.
+        known: matches of pairs of photographs that need not be matched again; new matches are added to them.
         neighbours: photographs taken near each photograph, see `overlapping_pairs`.
     """
-    known = {} if known is None else known
+    known = MatchedPairs() if known is None else known
     first = np.concatenate([[0], np.cumsum([len(of_photograph) for of_photograph in features])]).astype(
         np.int64
     )
@@ -183,13 +179,7 @@ def link_features(
     pairs = overlapping_pairs(compared, neighbours=neighbours)
 
     def match(of: IntArray) -> _MatchedFeatures:
-        every = [(i, j) for i, j in of.tolist()]
-        new = [pair for pair in every if pair not in known]
-        matches = in_threads(
-            lambda p: matched_features(features[p[0]], features[p[1]], seed=seed), new, threads
-        )
-        known.update(zip(new, reported("pairs of photographs matched", matches, len(new)), strict=True))
-        return _matched_features({pair: known[pair] for pair in every}, features, first)
+        return _matched_features(known.add(features, of, seed=seed, threads=threads), features, first)
 
     matched = match(pairs)
     part = connected_parts(pairs[np.unique(matched.pair)], len(features))

@@ -1,4 +1,4 @@
-"""The store of measurements in photographs, so that no photograph is measured twice.
+"""The store of measurements in photographs, and of matches between them, so that none is made twice.
 
 It is in the user's cache folder, never beside photographs or results, which may come from somebody else. The
 key of an entry depends on the content of the photograph, the settings and the measuring code. An entry can
@@ -24,12 +24,13 @@ import numpy as np
 from sfm.files.user_cache import make_user_folder, remove_unused, user_folder
 from sfm.files.whole_files import whole_file
 from sfm.matching.tracks.interest import NaturalPoints
+from sfm.matching.tracks.matched_pairs import MatchTable
 from sfm.model.errors import OutputError, PhotographError
 from sfm.runtime.compiling import sources_of
 from sfm.targets.detect import Targets
 
-Measured = Targets | NaturalPoints
-M = TypeVar("M", Targets, NaturalPoints)
+Measured = Targets | NaturalPoints | MatchTable
+M = TypeVar("M", Targets, NaturalPoints, MatchTable)
 MAX_ENTRY_BYTES = 100_000_000  # 400,000 targets, 180,000 features; checked before any memory is allocated
 
 
@@ -40,10 +41,15 @@ class Kind(Generic[M]):
     type: type[M]
     measuring: tuple[str, ...]  # modules that measure; the result depends on these and all their imports
     apart: str  # prefix of the arrays that share another length; all others share one length
+    mapped: str = ""  # array with a file of its own, which is read when it is used and takes no memory before
 
 
 TARGETS = Kind(Targets, ("sfm.photographs.reading", "sfm.targets.detect"), "rejected")
-TEXTURE = Kind(NaturalPoints, ("sfm.photographs.reading", "sfm.matching.tracks.interest"), "corners")
+TEXTURE = Kind(
+    NaturalPoints, ("sfm.photographs.reading", "sfm.matching.tracks.interest"), "corners", "descriptor"
+)
+MATCHES = Kind(MatchTable, ("sfm.matching.tracks.matched_pairs",), "pair_")
+MAPPED = {kind.type: kind.mapped for kind in (TARGETS, TEXTURE, MATCHES)}
 
 
 @dataclass(frozen=True)
@@ -81,7 +87,11 @@ class MeasuredStore:
                 if sum(entry.file_size for entry in archive.infolist()) > len(data):
                     raise ValueError("entries are stored as they are, these are packed")
             with np.load(io.BytesIO(data), allow_pickle=False) as stored:
-                arrays = {f.name: stored[f.name] for f in fields(kind.type)}
+                arrays = {f.name: stored[f.name] for f in fields(kind.type) if f.name != kind.mapped}
+            if kind.mapped:
+                mapped = np.load(path.with_suffix(".npy"), mmap_mode="c", allow_pickle=False)
+                arrays[kind.mapped] = mapped.view(np.ndarray)
+                os.utime(path.with_suffix(".npy"))
             for apart in (True, False):
                 if len({len(a) for name, a in arrays.items() if name.startswith(kind.apart) == apart}) != 1:
                     raise ValueError("arrays of different length")
@@ -95,13 +105,18 @@ class MeasuredStore:
         """Store measurements completely or not at all; without room on the disk they are not stored."""
         if self.folder is None:
             return
-        data = io.BytesIO()
-        np.savez(data, allow_pickle=False, **{f.name: getattr(measured, f.name) for f in fields(measured)})
+        arrays = {f.name: getattr(measured, f.name) for f in fields(measured)}
+        mapped, data = arrays.pop(MAPPED[type(measured)], None), io.BytesIO()
+        np.savez(data, allow_pickle=False, **arrays)
         if data.tell() > MAX_ENTRY_BYTES:  # `load` would not read it
             return
+        path = self._path(self.folder, key)
         with suppress(OSError, OutputError):
             make_user_folder(self.folder)
-            with whole_file(self._path(self.folder, key), replaces=True) as part:
+            if mapped is not None:
+                with whole_file(path.with_suffix(".npy"), replaces=True) as part:
+                    np.save(part, mapped, allow_pickle=False)
+            with whole_file(path, replaces=True) as part:
                 part.write_bytes(data.getbuffer())
 
     def remove_old(self) -> None:
@@ -140,8 +155,30 @@ def measured_once(
             return known, stored
     measured = measure()
     store.save(key, measured)
+    if kind.mapped:
+        measured = store.load(key, kind) or measured
     store.held[key] = measured, False
     return measured, False
+
+
+@dataclass(frozen=True)
+class StoredMatches:
+    """The matches of photographs in a store."""
+
+    store: MeasuredStore
+
+    def load(self, fingerprint: str, *, seed: int) -> MatchTable | None:
+        """Return the matches of a photograph, see `MatchStore.load`."""
+        return self.store.load(self._key(fingerprint, seed), MATCHES)
+
+    def save(self, fingerprint: str, table: MatchTable, *, seed: int) -> None:
+        """Keep the matches of a photograph, see `MatchStore.save`."""
+        self.store.save(self._key(fingerprint, seed), table)
+
+    @staticmethod
+    def _key(fingerprint: str, seed: int) -> str:
+        parts = (fingerprint, str(seed), _code_version(MATCHES.measuring))
+        return hashlib.sha256("\0".join(parts).encode()).hexdigest()
 
 
 def measured_key(path: Path, kind: Kind[M], settings: str) -> str:

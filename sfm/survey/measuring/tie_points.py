@@ -17,9 +17,10 @@ from scipy.spatial import cKDTree
 
 from sfm.judgement.survey_result import PhotographTargets
 from sfm.matching.radiometry import full_scale, grey_of
-from sfm.matching.tracks.feature_tracks import Matches, TiePoints, TrackSettings, find_tie_points
+from sfm.matching.tracks.feature_tracks import TiePoints, TrackSettings, find_tie_points
 from sfm.matching.tracks.features import MIN_PAIR_MATCHES
 from sfm.matching.tracks.interest import NaturalPoints, natural_points
+from sfm.matching.tracks.matched_pairs import MatchedPairs
 from sfm.matching.tracks.overlap import PARTNERS
 from sfm.model.conventions import BoolArray, FloatArray, IntArray
 from sfm.model.errors import GeometryError
@@ -34,7 +35,13 @@ from sfm.survey.inputs.measurements import Measurements, PhotographList
 from sfm.survey.inputs.settings import TiePointSettings
 from sfm.survey.inputs.start import network_of
 from sfm.survey.inputs.survey import Survey
-from sfm.survey.measuring.measured_store import TEXTURE, MeasuredStore, content_hash, measured_once
+from sfm.survey.measuring.measured_store import (
+    TEXTURE,
+    MeasuredStore,
+    StoredMatches,
+    content_hash,
+    measured_once,
+)
 from sfm.survey.measuring.targets import each_photograph
 from sfm.targets.outlines import estimate_noise
 
@@ -107,14 +114,14 @@ def tie_photographs(
         neighbours_by_position(metadata, PARTNERS),
         neighbours_in_sequence(names, metadata, PARTNERS),
     )
-    matches: Matches = {}
+    matched = MatchedPairs(store=None if store is None else StoredMatches(store))
 
     def tie(min_image_points: int) -> TiePoints:
         tied = find_tie_points(
             pictures,
             natural,
             threads=jobs,
-            known=matches,
+            known=matched,
             neighbours=neighbours,
             settings=TrackSettings(
                 window_px=settings.window_px,
@@ -131,14 +138,14 @@ def tie_photographs(
     scarce = np.flatnonzero(np.bincount(tied.image, minlength=len(read)) < SCARCE_TIE_POINTS).tolist()
     if "max_features" not in settings.model_fields_set:
         more = settings.model_copy(update={"max_features": MORE_FEATURES * settings.max_features})
-        alike = {a for pair, match in matches.items() if match.candidates >= MIN_PAIR_MATCHES for a in pair}
+        alike = {
+            a for pair, match in matched.known.items() if match.candidates >= MIN_PAIR_MATCHES for a in pair
+        }
         searched = [a for a in scarce if a in alike]
         for a in reported("photographs searched for more features", searched, len(searched)):
             natural[a] = natural_points_of(files.paths[read[a]], names[a], more, masks, store)[0]
-        again = set(searched)
-        for pair in [pair for pair in matches if not again.isdisjoint(pair)]:
-            del matches[pair]
-    if scarce and matches:
+        matched.forget(set(searched))
+    if scarce and matched.known:
         tied = tie(SCARCE_TIE_POINTS)
     if not len(tied):
         raise GeometryError(
@@ -160,7 +167,7 @@ def tie_photographs(
         failed,
         tuple(replace(overlay, stored=detected[k][2]) for k, overlay in zip(read, drawn, strict=True)),
         files,
-        remarks=_remarks_on_matching(len(matches), neighbours, tied.still, names),
+        remarks=_remarks_on_matching(len(matched.known), neighbours, tied.still, names),
     )
 
 
