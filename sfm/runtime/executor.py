@@ -13,8 +13,9 @@ from collections.abc import Callable, Iterable, Iterator
 from contextlib import contextmanager
 from contextvars import ContextVar
 from dataclasses import dataclass, field
-from typing import Any, Protocol
+from typing import Any, Protocol, TypeVar
 
+T = TypeVar("T")
 Send = Callable[[dict[str, Any]], None]  # accepts only plain values: text, numbers, lists
 
 
@@ -123,6 +124,11 @@ class Keeper(Protocol):
         """
 
 
+def itself(value: T) -> T:
+    """Return a value: a call that brings it to other processes."""
+    return value
+
+
 class KeptHere:
     """Keeper that computes everything in this process, one call after the other."""
 
@@ -139,7 +145,7 @@ class KeptHere:
 
     def fetch(self, calls: Iterable[Call]) -> list[Any]:
         """Return the results of calls, see `Keeper.fetch`."""
-        return self.keep(calls)
+        return [result for _, result in sorted(self.each(calls), key=lambda ended: ended[0])]
 
 
 @dataclass
@@ -175,6 +181,12 @@ _blocking: ContextVar[Blocking | None] = ContextVar("blocking", default=None)
 def current_blocking() -> Blocking | None:
     """Return how networks are adjusted in blocks; None if they are adjusted in one piece."""
     return _blocking.get()
+
+
+def other_processes() -> Keeper | None:
+    """Return the keeper of several other processes; None if this process works alone."""
+    blocking = current_blocking()
+    return None if blocking is None or blocking.keeper.workers < 2 else blocking.keeper
 
 
 @contextmanager

@@ -8,7 +8,7 @@ those that did not end, is not matched again.
 from __future__ import annotations
 
 import hashlib
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass, field
 from itertools import groupby
 from typing import Any, NamedTuple, Protocol
@@ -17,7 +17,7 @@ import numpy as np
 
 from sfm.matching.tracks.features import Features, PairMatches, TwoMotions, matched_features
 from sfm.model.conventions import AnyArray, BoolArray, FloatArray, IntArray
-from sfm.runtime.executor import Call, Keeper, current_blocking
+from sfm.runtime.executor import Call, Keeper, itself, other_processes
 from sfm.runtime.progress import reported
 from sfm.runtime.threads import in_threads
 
@@ -148,17 +148,15 @@ class MatchedPairs:
         for i, of_first in groupby(sorted(new), key=lambda pair: pair[0]):
             others = [j for _, j in of_first]
             blocks += [_Block(i, tuple(others[k : k + most])) for k in range(0, len(others), most)]
-        blocking = current_blocking()
-        if blocking is not None and blocking.keeper.workers > 1 and len(new) >= MIN_PAIRS_ELSEWHERE:
-            results: Iterator[tuple[_Block, list[PairMatches]]] = _matched_elsewhere(
-                features, blocks, seed, blocking.keeper
-            )
-        else:
 
-            def match(block: _Block) -> list[PairMatches]:
-                return matched_block(seed, features[block.image], *(features[j] for j in block.others))
+        def match(block: _Block) -> list[PairMatches]:
+            return matched_block(seed, features[block.image], *(features[j] for j in block.others))
 
-            results = zip(blocks, in_threads(match, blocks, threads), strict=True)
+        keeper = other_processes()
+        results: Iterable[tuple[_Block, list[PairMatches]]]
+        results = zip(blocks, in_threads(match, blocks, threads), strict=True)
+        if keeper is not None and len(new) >= MIN_PAIRS_ELSEWHERE:
+            results = _matched_elsewhere(features, blocks, seed, keeper)
         for block, matches in results:
             if store is not None:
                 store.write(block.image, dict(zip(block.others, matches, strict=True)))
@@ -224,10 +222,6 @@ def matched_block(seed: int, features: Features, *others: Features) -> list[Pair
     return [matched_features(features, of_other, seed=seed) for of_other in others]
 
 
-def _itself(features: Features) -> Features:
-    return features
-
-
 def _matched_elsewhere(
     features: Sequence[Features], blocks: Sequence[_Block], seed: int, keeper: Keeper
 ) -> Iterator[tuple[_Block, list[PairMatches]]]:
@@ -246,7 +240,7 @@ def _matched_elsewhere(
                     one = Features(
                         features[k].xy, features[k].scale, features[k].angle, features[k].descriptor
                     )
-                    kept[k] = keeper.keep([Call(_itself, (one,))])[0]
+                    kept[k] = keeper.keep([Call(itself, (one,))])[0]
                     held += one.xy.nbytes + one.descriptor.nbytes
             calls.append(Call(matched_block, (seed, kept[block.image], *(kept[j] for j in block.others))))
         for number, matches in keeper.each(calls):

@@ -16,7 +16,7 @@ from contextlib import suppress
 from dataclasses import dataclass, field, fields
 from functools import cache
 from pathlib import Path
-from typing import Generic, TypeVar
+from typing import Any, Generic, TypeVar
 
 import cv2
 import numpy as np
@@ -49,7 +49,7 @@ TEXTURE = Kind(
     NaturalPoints, ("sfm.photographs.reading", "sfm.matching.tracks.interest"), "corners", "descriptor"
 )
 MATCHES = Kind(MatchTable, ("sfm.matching.tracks.matched_pairs",), "pair_")
-MAPPED = {kind.type: kind.mapped for kind in (TARGETS, TEXTURE, MATCHES)}
+KINDS: tuple[Kind[Any], ...] = (TARGETS, TEXTURE, MATCHES)
 
 
 @dataclass(frozen=True)
@@ -106,7 +106,8 @@ class MeasuredStore:
         if self.folder is None:
             return
         arrays = {f.name: getattr(measured, f.name) for f in fields(measured)}
-        mapped, data = arrays.pop(MAPPED[type(measured)], None), io.BytesIO()
+        kind = next(kind for kind in KINDS if isinstance(measured, kind.type))
+        mapped, data = arrays.pop(kind.mapped, None), io.BytesIO()
         np.savez(data, allow_pickle=False, **arrays)
         if data.tell() > MAX_ENTRY_BYTES:  # `load` would not read it
             return
@@ -118,6 +119,20 @@ class MeasuredStore:
                     np.save(part, mapped, allow_pickle=False)
             with whole_file(path, replaces=True) as part:
                 part.write_bytes(data.getbuffer())
+
+    def adopt(self, held: dict[str, tuple[Measured, bool]]) -> None:
+        """Hold what another process measured, and store it unless it is there.
+
+        Args:
+            held: measurements by their keys, as they are held there.
+        """
+        for key, (measured, stored) in held.items():
+            kind = next(kind for kind in KINDS if isinstance(measured, kind.type))
+            kept = self.load(key, kind)
+            if kept is None:
+                self.save(key, measured)
+                kept = self.load(key, kind) if kind.mapped else None
+            self.held[key] = (measured if kept is None else kept), stored
 
     def remove_old(self) -> None:
         """Remove entries not used for months, and half-written files of a killed run."""

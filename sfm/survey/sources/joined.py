@@ -6,7 +6,7 @@ Photographs and points are joined by their names. A point that several sources m
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from contextlib import nullcontext
+from contextlib import nullcontext, suppress
 from dataclasses import dataclass, replace
 from importlib import import_module
 from pathlib import Path
@@ -29,6 +29,7 @@ from sfm.model.remarks.remark import Remark, remark
 from sfm.orientation.image_rays import intersect_image_points
 from sfm.orientation.incremental.sequence import Orientation
 from sfm.photographs.reading import decoding_once
+from sfm.runtime.executor import Call, itself, other_processes
 from sfm.runtime.progress import Progress, StageClock
 from sfm.survey.inputs.measurements import NO_NAMES, Measurements, Naming, PhotographList
 from sfm.survey.inputs.settings import AdjustSettings
@@ -36,7 +37,7 @@ from sfm.survey.inputs.sources import Declared, declared, stated_sources
 from sfm.survey.inputs.start import network_of, scale_bars
 from sfm.survey.inputs.survey import Survey
 from sfm.survey.inputs.survey_file import SurveyFile
-from sfm.survey.measuring.measured_store import MeasuredStore
+from sfm.survey.measuring.measured_store import Measured, MeasuredStore
 from sfm.survey.measuring.surface_points import RAYS_OF_NOISE, with_weights
 from sfm.survey.measuring.targets import each_photograph
 from sfm.survey.orientation import Oriented
@@ -72,10 +73,10 @@ def measure_sources(
     measured = {}
     sources = sources_of(survey)
     listed_first = sorted(sources, key=lambda pair: not pair[0].is_listed)  # faults of files show first
-    several = sum(source.measure_one is not None for _, source in sources) > 1
+    first = sum(source.measure_one is not None for _, source in sources) > 1 or other_processes() is not None
     for row, source in listed_first:
-        if several and source.measure_one is not None:
-            several, store = False, store or MeasuredStore(None)
+        if first and source.measure_one is not None:
+            first, store = False, store or MeasuredStore(None)
             with clock.stage("photographs", len(files)):
                 _measure_each(survey, files, jobs=jobs, store=store, progress=clock.progress)
         with clock.stage(row.stage, len(files)) if row.stage else nullcontext():
@@ -86,14 +87,34 @@ def measure_sources(
 def _measure_each(
     survey: Survey, files: PhotographList, *, jobs: int, store: MeasuredStore, progress: Progress
 ) -> None:
-    """Measure each photograph for all sources while it is in memory; the store holds what they find."""
-    names = dict(zip(files.paths, files.names, strict=True))
-    each_photograph(
-        files,
-        lambda path: measure_photograph_once(survey, names[path], path, store),
-        jobs=jobs,
-        progress=progress,
-    )
+    """Measure each photograph for all sources while it is in memory; the store holds what they find.
+
+    Other processes measure, if there are any; what they cannot read is left to this one.
+    """
+    names, keeper = dict(zip(files.paths, files.names, strict=True)), other_processes()
+    if keeper is None:
+        each_photograph(
+            files,
+            lambda path: measure_photograph_once(survey, names[path], path, store),
+            jobs=jobs,
+            progress=progress,
+        )
+        return
+    kept = keeper.keep([Call(itself, (survey,))])[0]
+
+    def measured_there(path: Path) -> None:
+        call = Call(_measured_photograph, (kept, names[path], path.absolute()))
+        store.adopt(keeper.fetch([call])[0])
+
+    with suppress(GeometryError):  # too few that they can read
+        each_photograph(files, measured_there, jobs=keeper.workers, progress=progress)
+
+
+def _measured_photograph(survey: Survey, image: str, path: Path) -> dict[str, tuple[Measured, bool]]:
+    """Return what is found in a photograph by its keys in a store, each with whether it was read from it."""
+    store = MeasuredStore.of_user()
+    measure_photograph_once(survey, image, path, store)
+    return store.held
 
 
 def measure_photograph_once(
