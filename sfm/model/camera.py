@@ -22,6 +22,9 @@ from sfm.runtime.compiling import compiled, inlined, kernel
 STEPS, HALVINGS = 100, 20  # of Newton's method, and of one of its steps
 PIXEL_TOLERANCE = 1e-10
 EDGE_PIXELS = 9  # of each edge of a photograph, whose rays show its field of view
+# Factor of the angle of the field of view: with decentring, the widest ray of an edge is not at its corners,
+# and lies between those that are computed.
+FIELD_MARGIN = 1.05
 PLACES = 16  # between the axis and a ray at which the distortion is tested for a fold
 # Directions in which the range without a fold is found once for many points, the radius where the search
 # begins in half diagonals of the photograph, its next radius as a part of the one before, and the part of the
@@ -526,6 +529,25 @@ def project(camera: Camera, position: FloatArray, rotation: FloatArray, points: 
     Source: Kraus (2007), eq. 5.1-1.
     """
     return pixel_from_rays(camera, (np.asarray(points, dtype=float) - position) @ rotation)
+
+
+def in_field(
+    camera: Camera, position: FloatArray, rotation: FloatArray, points: FloatArray, reach_px: float = 0.0
+) -> BoolArray:
+    """Return which object points are in the field of view of a photograph, (n,); no other can be shown in it.
+
+    To project what is far outside may take long.
+
+    Args:
+        camera: interior orientation.
+        position: projection centre X0, shape (3,), object unit.
+        rotation: R, image to object axes, shape (3, 3).
+        points: object points, shape (n, 3), object unit; those that are not finite are seen nowhere.
+        reach_px: how far the field reaches beyond the edges of the photograph, px.
+    """
+    rays = (points - position) @ rotation
+    off_axis = np.arctan2(np.linalg.norm(rays[:, :2], axis=1), -rays[:, 2])
+    return np.asarray(off_axis <= FIELD_MARGIN * camera.field_angle + reach_px / camera.c_px)
 
 
 def pixel_jacobian(camera: Camera, xy_px: FloatArray) -> FloatArray:

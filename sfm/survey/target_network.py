@@ -11,7 +11,7 @@ from dataclasses import replace
 import numpy as np
 
 from sfm.matching.tracks.correspondence import match_targets
-from sfm.model.camera import project
+from sfm.model.camera import in_field, project
 from sfm.model.conventions import FloatArray, IntArray
 from sfm.model.estimate import Estimate
 from sfm.model.network import ImagePoints, Network, ScaleBars, rows_of
@@ -175,15 +175,18 @@ def match_uncoded(
         named = np.full(len(targets), UNNAMED)
         if oriented[i]:
             camera = estimate.cameras[photographs.camera[i]]
-            projected = project(camera, estimate.position[i], estimate.rotation[i], known)
-            named = _coinciding_points(
+            far_px = MAX_SEMI_AXES * targets.semi_axes[:, 0]
+            pose, reach_px = (estimate.position[i], estimate.rotation[i]), float(max([tolerance_px, *far_px]))
+            near = np.flatnonzero(in_field(camera, *pose, known, reach_px))
+            of_near = _coinciding_points(
                 targets.xy,
-                projected,
+                project(camera, *pose, known[near]),
                 targets.code,
-                naming.code[coded],
+                naming.code[coded[near]],
                 tolerance_px,
-                MAX_SEMI_AXES * targets.semi_axes[:, 0],
+                far_px,
             )
+            named[of_near >= 0] = near[of_near[of_near >= 0]]
         point.append(named)
     free = [np.flatnonzero(named == UNNAMED) for named in point]
     matches = match_targets(

@@ -11,7 +11,7 @@ from collections.abc import Iterable, Sequence
 import cv2
 import numpy as np
 
-from sfm.model.camera import pixel_from_tangents, ray_directions, tangents_from_pixel
+from sfm.model.camera import FIELD_MARGIN, pixel_from_tangents, ray_directions, tangents_from_pixel
 from sfm.model.conventions import AnyArray, BoolArray, FloatArray, IntArray
 from sfm.model.estimate import Estimate
 from sfm.model.network import ImagePoints, rows_of
@@ -19,9 +19,6 @@ from sfm.runtime.compiling import compiled
 
 # Ratio of precisions for the same pixels up to which the preferred windows are used.
 MAX_COST_RATIO = 1.1
-# Factor of the angle of the field of view: with decentring, the widest ray of an edge is not at its corners,
-# and lies between those that are computed.
-FIELD_MARGIN = 1.05
 MAX_SHARED_FRACTION = 0.15  # of the pixels of a point, or of a window, that others may have measured
 SAMPLES = np.linspace(-0.42, 0.42, 6)  # positions in a window, in sides, where coverage is checked
 

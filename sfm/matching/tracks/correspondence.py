@@ -148,7 +148,7 @@ def match_targets(
         math.cos(math.radians(limits.min_angle_deg)),
         unusable,
         [],
-        [],
+        np.zeros((0, 3)),
     )
     while _take_best(search, max(3, min_rays), math.log(limits.max_false)):
         pass
@@ -168,7 +168,7 @@ class _Search:
     cos_angle: float  # of the smallest angle between rays
     used: BoolArray  # targets that no longer take part, (N,)
     tracks: list[IntArray]  # of each accepted point, its target in each photograph or -1, (m,)
-    points: list[FloatArray]  # of each accepted point, its coordinates, (3,)
+    points: FloatArray  # coordinates of the accepted points, object unit, (n, 3)
 
     def seeds(self) -> IntArray:
         """Return pairs of unused targets on each other's epipolar lines, (s, 2)."""
@@ -183,12 +183,27 @@ class _Search:
         If the orientation is off by more than the tolerance, one target may split into two points.
         """
         self.used[track[track >= 0]] = True
-        reach = SAME_TOLERANCES * self.scene.tolerance
-        for other, its_point in zip(self.tracks, self.points, strict=True):
-            if same_target(self.scene, track, point, other, its_point, reach):
+        for k in self._near(track, point):
+            if same_target(self.scene, track, point, self.tracks[k], self.points[k], self._reach_px):
                 return
         self.tracks.append(track.copy())
-        self.points.append(point.copy())
+        self.points = np.vstack([self.points, point])
+
+    @property
+    def _reach_px(self) -> float:
+        """Distance in photographs within which two points may be one target, px."""
+        return SAME_TOLERANCES * self.scene.tolerance
+
+    def _near(self, track: IntArray, point: FloatArray) -> IntArray:
+        """Return the accepted points that may be one target with a point: within its reach of two rays of it.
+
+        Along a ray that is as far as two rays at the smallest angle leave open.
+        """
+        images = np.flatnonzero(track >= 0)
+        ranges = np.linalg.norm(point - self.scene.position[images], axis=1)
+        reach = self._reach_px * float((ranges / self.scene.c[images]).max())
+        away = np.linalg.norm(self.points - point, axis=1)
+        return np.flatnonzero(away <= 2 * reach / math.sqrt(1 - self.cos_angle**2))
 
 
 def _take_best(search: _Search, min_rays: int, log_max_false: float) -> int:
@@ -237,7 +252,7 @@ def _collect(search: _Search) -> Correspondences:
         none = np.zeros(0, dtype=np.int64)
         return Correspondences(none, none, none, np.zeros(0), np.zeros((0, 3)))
     scene = search.scene
-    tracks, points = np.array(search.tracks), np.array(search.points)
+    tracks, points = np.array(search.tracks), search.points
     order = np.argsort(np.where(tracks >= 0, tracks, len(search.used)).min(axis=1), kind="stable")
     tracks, points = tracks[order], points[order]
     residual = np.zeros(tracks.shape)
