@@ -14,6 +14,7 @@ from sfm.matching.conjugate import difference_of_blur, match_points
 from sfm.matching.conjugate_patches import MatchSettings
 from sfm.matching.epipolar import epipolar_distance, essential_matrices
 from sfm.matching.lsm.surface_planes import on_surface
+from sfm.matching.tracks import correspondence, evidence
 from sfm.matching.tracks.correspondence import match_targets
 from sfm.model.camera import camera_from_values, project, tangents_from_pixel
 from sfm.model.conventions import BoolArray, FloatArray, rotation_from_angles, rotation_from_vector
@@ -161,6 +162,28 @@ def test_an_orientation_beyond_the_tolerance_costs_points_but_makes_no_wrong_one
     assert precision > 0.99
     assert 0.3 < recall < 0.95
     assert double <= 2
+
+
+@pytest.mark.parametrize("tolerance", [3, 4])
+def test_accepted_points_are_compared_with_near_ones_as_with_all(tolerance, monkeypatch):
+    """The orientation splits targets in two, some of which the comparison recognises."""
+    rng, network = generator(f"near {tolerance}"), convergent_network(21)
+    targets, _ = measure(network, plane_grid(14), rng, noise_px=0.1)
+    start, camera = disturbed(network, rng, shift=0.001, turn_deg=0.1), np.zeros(21, dtype=int)
+    same = []
+
+    def compared(*arguments):
+        same.append(evidence.same_target(*arguments))
+        return same[-1]
+
+    monkeypatch.setattr(correspondence, "same_target", compared)
+    found = match_targets(start, camera, targets, tolerance_px=tolerance)
+    near, repeated = len(same), sum(same)
+    monkeypatch.setattr(correspondence._Search, "_near", lambda search, *_: range(len(search.points)))
+    every = match_targets(start, camera, targets, tolerance_px=tolerance)
+    assert repeated > 0 and sum(same) == 2 * repeated and len(same) > 2 * near
+    for name in ("image", "target", "point", "points"):
+        np.testing.assert_array_equal(getattr(found, name), getattr(every, name))
 
 
 def test_points_of_three_rays_need_a_small_tolerance():
