@@ -93,6 +93,28 @@ def test_a_point_is_found_wherever_in_the_photograph_and_around_it(model: str) -
         assert near == {row: other} and far != near
 
 
+@pytest.mark.parametrize("chord", [1e-4, 0.02, 0.4, 2.0, np.nan, np.inf])
+def test_points_in_a_direction_are_those_of_the_plain_way(chord: float) -> None:
+    """Also of places among the points, and at one of them, and with points that are nowhere."""
+    random = np.random.default_rng(seed_of("groups"))
+    points = random.normal(scale=(50.0, 30.0, 2.0), size=(3000, 3))
+    points[::97] = np.nan
+    groups = rejections._Groups.of(points)
+    found = 0
+    for place in (*random.normal(scale=40.0, size=(20, 3)), points[5], np.array([0.0, 0.0, 900.0])):
+        direction = points[random.integers(1, 97)] - place
+        direction /= np.linalg.norm(direction)
+        outward = points - place
+        with np.errstate(invalid="ignore"):
+            outward /= np.linalg.norm(outward, axis=1, keepdims=True)
+        plain = np.linalg.norm(outward - direction, axis=1) <= chord
+        expected = np.flatnonzero(plain) if np.isfinite(chord) else np.arange(len(points))
+        assert np.array_equal(groups.within(place, direction, chord), expected)
+        found += len(expected)
+    assert found > 0
+    assert len(rejections._Groups.of(points[:0]).within(np.zeros(3), np.array([0.0, 0.0, 1.0]), 0.1)) == 0
+
+
 def test_a_point_is_not_taken_for_itself(clean: Adjustment) -> None:
     row = row_of(clean, 3, 1)
     a = with_rejected(clean, {row: at(clean, row, clean.estimate.points[3])})
