@@ -473,23 +473,24 @@ def photograph_support(
         beyond = np.maximum(count - RELATIVE_UNKNOWNS, 0)
         surplus += np.bincount(first, beyond, minlength=m) + np.bincount(second, beyond, minlength=m)
     confirmed = _count(alone, seen.image, m) + surplus.astype(np.int64)
-    against = ~fits & (known | _inside_network(network, estimate))
+    against = ~fits & (known | _inside_network(network, estimate, ~fits & ~known))
     fitting, known_count, against_count = (_count(rows, seen.image, m) for rows in (fits, known, against))
     return Support(fitting, known_count, confirmed, against_count)
 
 
-def _inside_network(network: Network, estimate: Estimate) -> BoolArray:
-    """Return which image points lie inside the convex hull of the projected network, (k,)."""
+def _inside_network(network: Network, estimate: Estimate, asked: BoolArray) -> BoolArray:
+    """Return which of some image points lie inside the convex hull of the projected network, (k,)."""
     seen = network.image_points
     out = np.zeros(len(seen), dtype=bool)
     points = estimate.points[estimate.determined]
-    of_image = rows_of(seen.image, len(network.images))
-    for i in np.flatnonzero(estimate.oriented):
-        camera = estimate.cameras[network.camera[i]]
+    chosen = np.flatnonzero(asked & estimate.oriented[seen.image])
+    for i, of_image in enumerate(rows_of(seen.image[chosen], len(network.images))):
+        if not len(of_image):
+            continue
+        rows, camera = chosen[of_image], estimate.cameras[network.camera[i]]
         xy = project(camera, estimate.position[i], estimate.rotation[i], points)
         xy = xy[((xy >= 0) & (xy < camera.size_px)).all(axis=1)]
-        rows = of_image[i]
-        if len(xy) < 3 or not len(rows):
+        if len(xy) < 3:
             continue
         try:
             lines = ConvexHull(xy).equations
