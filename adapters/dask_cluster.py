@@ -8,6 +8,7 @@ from __future__ import annotations
 import asyncio
 import gc
 import logging
+import math
 import queue
 import signal
 import sys
@@ -80,9 +81,14 @@ NO_PAGES: dict[str, list[str]] = {
 }
 
 
-def fitting_workers() -> int:
-    """Return how many workers the available cores and memory of this computer allow."""
-    return max(1, min(dask.system.CPU_COUNT, distributed.system.MEMORY_LIMIT // WORKER_BYTES))
+def fitting_workers(needed_bytes: float = 0.0) -> int:
+    """Return how many workers the available cores and memory of this computer allow.
+
+    Args:
+        needed_bytes: memory of the largest call, bytes; `WORKER_BYTES` at least are taken for it.
+    """
+    memory = int(distributed.system.MEMORY_LIMIT // max(WORKER_BYTES, needed_bytes))
+    return max(1, min(dask.system.CPU_COUNT, memory))
 
 
 @contextmanager
@@ -287,6 +293,16 @@ class DaskEngine:
         """Number of calls that run at a time, at least 1 while workers are still starting."""
         threads: dict[str, int] = self.client.nthreads()
         return max(1, sum(threads.values()))
+
+    @property
+    def call_bytes(self) -> float:
+        """Memory of the largest worker, bytes, beyond which it is ended; infinite if unlimited or unknown."""
+        try:
+            workers = self.client.scheduler_info(n_workers=-1)["workers"].values()
+        except OSError:  # the scheduler is gone, which the run will state
+            return math.inf
+        limits = [float(worker.get("memory_limit") or math.inf) for worker in workers]
+        return max(limits, default=math.inf)
 
     def run(self, works: Iterable[Work], *, at_a_time: int) -> Iterator[Event]:
         """Run all work and yield its events, see sfm.runtime.threads.Engine.

@@ -22,6 +22,7 @@ if TYPE_CHECKING:
     from sfm.report.output import SurveyLog
 
 RINGS_PICTURE = "-rings.png"  # after the name of a drafted survey file
+REMEDY_OF_POINTS = "end other programs, use a larger computer, or adjust in blocks on a cluster (--cluster)"
 SURVEY_FILE = "survey.toml"  # name in a folder of photographs
 
 
@@ -86,7 +87,7 @@ def run_survey_file(survey_file: Path, options: RunOptions) -> Path:
             refuse_other_origin,
             write_result,
         )
-        from sfm.runtime.forecast import Run, RunHistory, forecast
+        from sfm.runtime.forecast import OTHER_REMEDY, Run, RunHistory, forecast
         from sfm.runtime.memory import peak_bytes
         from sfm.runtime.progress_bar import drawn_progress
         from sfm.runtime.threads import cores, one_blas_thread
@@ -156,7 +157,9 @@ def run_survey_file(survey_file: Path, options: RunOptions) -> Path:
     ):
         history, work = RunHistory.of_user(), work_of(survey, files)
         expected = forecast(work, history.read())
-        if options.cluster is None and (sentence := expected.announced()):
+        if options.cluster is None:
+            expected.refuse(remedy=OTHER_REMEDY if from_photographs else REMEDY_OF_POINTS)
+        if sentence := expected.announced():
             print(sentence, file=sys.stderr)
         drawn.countdown.expected = expected.seconds
         log.start(survey.name, survey_file, **origin.written(folder))

@@ -5,6 +5,7 @@ An adapter is imported by the function that needs it.
 
 from __future__ import annotations
 
+import sys
 from collections.abc import Callable
 from contextlib import ExitStack
 from dataclasses import replace
@@ -73,13 +74,17 @@ def run_survey(
     with ExitStack() as stack:
         stack.enter_context(one_blas_thread())
         watching: Progress = SILENT
+        files = (
+            find_photographs(survey, images_dir=images_dir) if reads_photographs(survey) else NO_PHOTOGRAPHS
+        )
+        expected = forecast(work_of(survey, files), RunHistory.of_user().read(), without=("report",))
+        expected.refuse()
         if progress is True:
             from sfm.runtime.progress_bar import drawn_progress
 
             watching = drawn = stack.enter_context(drawn_progress())
-            reads = reads_photographs(survey)
-            files = find_photographs(survey, images_dir=images_dir) if reads else NO_PHOTOGRAPHS
-            expected = forecast(work_of(survey, files), RunHistory.of_user().read(), without=("report",))
+            if sentence := expected.announced():
+                print(sentence, file=sys.stderr)
             drawn.countdown.expected = expected.seconds
         elif progress is not False:
             watching = progress

@@ -77,6 +77,10 @@ class Engine(Protocol):
     def workers(self) -> int:
         """Number of calls that run at a time."""
 
+    @property
+    def call_bytes(self) -> float:
+        """Memory that a call may take, bytes; infinite where it is not limited."""
+
     def run(self, works: Iterable[Work], *, at_a_time: int) -> Iterator[Event]:
         """Run all work and yield the events; more of `works` is taken when there is room.
 

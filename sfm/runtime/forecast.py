@@ -43,9 +43,12 @@ OTHER_GROWTH = (1.0, 0.0, 0.6)
 # rendered photographs (0.8 to 0.9), and of 12,500 to 650,000 given image points.
 PROGRAM_MB = 360.0
 MEMORY_GROWTH = (0.85, 0.4, 1.0)
-# Expected memory over what there is, from which a survey is refused: of surveys within a factor of eight in
-# size, the expectation was right to 22 % (docs/validation.md).
-MEMORY_MARGIN = 1.3
+# Relative standard deviation of expected memory, and what is added by each factor of e between the sizes of
+# the survey and of the run that it is scaled from: the errors, 1 to 12 % near in size, and 1 to 18 % a factor
+# of e beyond (docs/validation.md, "Time and memory said beforehand").
+MEMORY_SIGMA, MEMORY_SIGMA_BY_DISTANCE = 0.1, 0.1
+MEMORY_SIGMAS = 2.0  # below the expected memory, at which a survey is refused that does not fit even so
+OTHER_REMEDY = "end other programs, use a larger computer, or take fewer photographs or smaller ones"
 LONG_SECONDS = 60.0  # of a survey whose time and memory are said before it begins
 MEASURED = ("photographs", "targets", "tie points")  # stages that measure several photographs at a time
 
@@ -142,21 +145,35 @@ class Forecast:
 
     seconds: dict[str, float]  # of each stage, in their order, s; empty where no run was alike
     memory_mb: float = 0.0  # its peak, 10^6 bytes; 0 where no run was alike
-    measured_at_this_size: bool = False  # whether a run of about this size took that memory
+    distance: float = 0.0  # from the run that the memory is scaled from, see Work.distance
 
-    def announced(self) -> str:
-        """Return one sentence on the time and memory of a long survey; empty for others.
+    @property
+    def least_memory_mb(self) -> float:
+        """Lower bound of the memory, 10^6 bytes; the farther below, the less the run was alike."""
+        sigma = math.hypot(MEMORY_SIGMA, MEMORY_SIGMA_BY_DISTANCE * self.distance)
+        return self.memory_mb * math.exp(-MEMORY_SIGMAS * sigma)
+
+    def refuse(self, *, there_bytes: float | None = None, remedy: str = OTHER_REMEDY) -> None:
+        """Refuse a survey that needs more memory than there is, even by the lower bound.
+
+        Args:
+            there_bytes: memory that there is for it, bytes; None: for this process.
+            remedy: what can be done.
 
         Raises:
-            KolinearError: a run of about this size took much more memory than there is.
+            KolinearError: it does not fit.
         """
+        there = (within_bytes() if there_bytes is None else there_bytes) / 1e6
+        if self.least_memory_mb > there:
+            raise KolinearError(
+                f"the survey needs about {self.memory_mb / 1000:.1f} GB of memory, at least "
+                f"{self.least_memory_mb / 1000:.1f} GB, and {there / 1000:.1f} GB are there for it: {remedy}"
+            )
+
+    def announced(self) -> str:
+        """Return one sentence on the time and memory of a long survey; empty for others."""
         there = within_bytes() / 1e6
         needs = f"{self.memory_mb / 1000:.1f} GB of memory"
-        if self.memory_mb > MEMORY_MARGIN * there and self.measured_at_this_size:
-            raise KolinearError(
-                f"the survey needs about {needs}, and {there / 1000:.1f} GB are there for it: end other "
-                "programs, use a larger computer or --cluster, or take fewer photographs or smaller ones"
-            )
         whole, short = sum(self.seconds.values()), self.memory_mb > there
         if whole < LONG_SECONDS and not short:
             return ""
@@ -180,7 +197,7 @@ def forecast(work: Work, runs: Sequence[Run], *, without: Container[str] = ()) -
     seconds = {stage: took for stage, took in nearest.scaled_to(work).items() if stage not in without}
     if measured is None:
         return Forecast(seconds)
-    return Forecast(seconds, measured.memory_scaled_to(work), measured.work.distance(work) < OTHERS_APART)
+    return Forecast(seconds, measured.memory_scaled_to(work), measured.work.distance(work))
 
 
 def duration(seconds: float) -> str:

@@ -166,10 +166,30 @@ def test_a_long_survey_is_announced_and_one_without_room_refused(monkeypatch: py
     monkeypatch.setattr("sfm.runtime.forecast.within_bytes", lambda: 6e9)
     assert forecast(long.work, [long]).announced() == f"{expected}, of which 6.0 GB are there"
     monkeypatch.setattr("sfm.runtime.forecast.within_bytes", lambda: 5e9)
-    with pytest.raises(KolinearError, match=r"needs about 6\.6 GB of memory, and 5\.0 GB are there"):
-        forecast(long.work, [long]).announced()
-    far = Work(("targets",), 20_000, 1.0)  # nothing of this size is known, so that it is only told
-    assert forecast(far, [long]).announced().endswith("GB of memory, of which 5.0 GB are there")
+    assert forecast(long.work, [long]).announced() == f"{expected}, of which 5.0 GB are there"
+    with pytest.raises(
+        KolinearError, match=r"needs about 6\.6 GB of memory, at least 5\.4 GB, and 5\.0 GB are"
+    ):
+        forecast(long.work, [long]).refuse()
+    with pytest.raises(KolinearError, match=r"are there for it: do something$"):
+        forecast(long.work, [long]).refuse(remedy="do something")
+    forecast(long.work, [long]).refuse(there_bytes=6e9)
+    forecast(unknown.work, [unknown]).refuse(there_bytes=1e6)  # nothing is known of its memory
+
+
+def test_the_lower_bound_of_memory_is_the_lower_the_less_alike_a_run_was() -> None:
+    run = Run(Work(("texture",), 250, 0.31), {"tie points": 46.0}, 2200.0)
+    by_size = [forecast(Work(("texture",), count, 0.31), [run]) for count in (250, 1_000, 10_000, 100_000)]
+    shares = [each.least_memory_mb / each.memory_mb for each in by_size]
+    assert shares == sorted(shares, reverse=True) and 0.75 < shares[0] < 0.9
+    # the one of 10,000 photographs is refused on 16 GB, and one of 1,000 on none that it can fit
+    with pytest.raises(KolinearError, match="needs about 42"):
+        by_size[2].refuse(there_bytes=16e9)
+    measured_mb = 7800.0  # where 6.5 GB were expected from 250
+    assert by_size[1].least_memory_mb < measured_mb < by_size[1].memory_mb ** 2 / by_size[1].least_memory_mb
+    by_size[1].refuse(there_bytes=6e9)
+    few = forecast(Work(("texture",), 2, 0.31), [run])  # smaller ones are scaled as far
+    assert few.least_memory_mb / few.memory_mb < shares[1]
 
 
 def test_a_stage_that_finds_more_to_do_says_nothing_of_the_others() -> None:

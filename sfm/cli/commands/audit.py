@@ -109,6 +109,7 @@ def audit(
     ):
         history, work = RunHistory.of_user(), work_of(audited, NO_PHOTOGRAPHS)
         expected = forecast(work, history.read(), without=("comparison",))
+        expected.refuse(remedy="end other programs, or use a larger computer")
         if sentence := expected.announced():
             print(sentence, file=sys.stderr)
         drawn.countdown.expected = expected.seconds

@@ -30,6 +30,7 @@ from sfm.model.errors import (
 )
 from sfm.runtime.executor import Call, Done, Engine, Event, Lost, Sent, Work
 from sfm.runtime.faults import FAULT
+from sfm.runtime.memory import within_bytes
 
 if TYPE_CHECKING:
     from sfm.survey.assembly import OtherPrograms
@@ -54,7 +55,8 @@ def batch(
             "--jobs",
             metavar="N",
             min=1,
-            help="Number of worker processes.  [default: one per core and 1.5 GiB of memory]",
+            help="Number of worker processes.  [default: one per core and 1.5 GiB of memory, "
+            "or what the largest survey needs]",
         ),
     ] = None,
     cluster: Annotated[
@@ -87,7 +89,7 @@ def batch(
 
         from sfm.library.surveys import colmap_writer
         from sfm.products.batch.job import Comparers
-        from sfm.products.batch.run import calls_of, find_surveys, run_batch
+        from sfm.products.batch.run import calls_of, find_surveys, memory_of, run_batch
         from sfm.products.batch.table import (
             BatchTable,
             print_batch,
@@ -110,6 +112,7 @@ def batch(
     compile_first()
     engine = batch_engine(
         partial(calls_of, files, allow_outside=allow_outside),
+        partial(memory_of, files, allow_outside=allow_outside),
         jobs=jobs,
         cluster=cluster,
         send=partial(print, file=sys.stderr),
@@ -152,12 +155,18 @@ def _programs_of_worker(survey: Survey) -> OtherPrograms:
 
 
 def batch_engine(
-    busy: Callable[[], int], *, jobs: int | None, cluster: str | None, send: Callable[[str], None]
+    busy: Callable[[], int],
+    needed_bytes: Callable[[], float],
+    *,
+    jobs: int | None,
+    cluster: str | None,
+    send: Callable[[str], None],
 ) -> AbstractContextManager[Engine]:
     """Return the engine of a batch.
 
     Args:
         busy: returns the largest number of calls that can run at a time; more workers would be idle.
+        needed_bytes: returns the memory of the largest call that fits this computer, bytes.
         jobs: number of workers on this computer; if None, as many as its cores and memory allow.
         cluster: address of a Dask scheduler to use instead.
         send: receives one line with the reason if surveys run one after the other.
@@ -179,7 +188,7 @@ def batch_engine(
     if cluster is not None:
         engine = dask.remote_engine(cluster, "--cluster")
     else:
-        engine = dask.local_engine(min(jobs or dask.fitting_workers(), busy()))
+        engine = dask.local_engine(min(jobs or dask.fitting_workers(needed_bytes()), busy()))
     return engine
 
 
@@ -190,6 +199,11 @@ class InProcess:
     """
 
     workers = 1
+
+    @property
+    def call_bytes(self) -> float:
+        """Memory that this process may take, bytes."""
+        return within_bytes()
 
     def run(self, works: Iterable[Work], *, at_a_time: int) -> Iterator[Event]:
         """Run all work one call at a time, regardless of `at_a_time`, and yield events.

@@ -45,7 +45,9 @@ from sfm.products.drafting.frames_folder import videos_of
 from sfm.report.output import SurveyLog, folder_name, refuse_other_log, remove_log
 from sfm.report.viewer.pictures import BUDGET_MB
 from sfm.runtime.executor import Call, Done, Engine, Lost, Sent, Work, WorkerLost
+from sfm.runtime.forecast import Forecast, RunHistory, forecast
 from sfm.runtime.forecast import Work as Extent
+from sfm.runtime.memory import limit_bytes
 from sfm.survey.inputs.measurements import NO_PHOTOGRAPHS, find_photographs, masks_of, work_of
 from sfm.survey.inputs.named_folders import named_folder
 from sfm.survey.inputs.sources import reads_photographs
@@ -55,6 +57,7 @@ from sfm.survey.inputs.survey_file import SurveyFile, read_survey_file
 from sfm.survey.measuring.measured_store import MeasuredStore
 
 SURVEY_NAME = "survey.toml"  # searched for in folders
+MEMORY_REMEDY = "run fewer --jobs, use workers with more memory, or take fewer photographs or smaller ones"
 NONE: Mapping[Path, Exception] = MappingProxyType({})
 
 
@@ -137,13 +140,16 @@ def run_batch(
         _remove_half_written(out, plans)
         try:
             with engine as running:
-                watch.planned({plan.folder: _extent_of(plan) for plan in plans}, running.workers)
+                extents = {plan.folder: _extent_of(plan) for plan in plans}
+                watch.planned(extents, running.workers)
                 rows = _run(
                     plans,
                     out,
                     running,
                     comparers,
                     watch,
+                    expected=_forecasts(extents),
+                    call_bytes=running.call_bytes,
                     resume=resume,
                     allow_outside=allow_outside,
                     pictures_mb=pictures_mb,
@@ -276,6 +282,8 @@ def _run(
     comparers: Comparers,
     watch: Watch,
     *,
+    expected: Mapping[str, Forecast],
+    call_bytes: float,
     resume: bool,
     allow_outside: bool,
     pictures_mb: float,
@@ -316,6 +324,8 @@ def _run(
                     )
                     earlier = None
                 if earlier is None:
+                    if plan.folder in expected:
+                        expected[plan.folder].refuse(there_bytes=call_bytes, remedy=MEMORY_REMEDY)
                     works[plan.folder] = _work(job, plan.survey, comparers)
             except Exception as error:
                 finish(plan.folder, _row_without_result(plan, out, "failed", error))
@@ -363,6 +373,25 @@ def _extent_of(plan: _Plan) -> Extent | None:
         return work_of(survey, files)
     except Exception:  # its run states the reason
         return None
+
+
+def _forecasts(extents: Mapping[str, Extent | None]) -> dict[str, Forecast]:
+    """Return the expected time and memory of surveys, by the names of their folders."""
+    runs = RunHistory.of_user().read()
+    return {name: forecast(extent, runs) for name, extent in extents.items() if extent is not None}
+
+
+def memory_of(files: Sequence[Path], *, allow_outside: bool = False) -> float:
+    """Return the expected memory of the largest survey that may fit this computer, bytes; 0 without any.
+
+    Args:
+        files: survey files.
+        allow_outside: whether survey files may name files outside their folders.
+    """
+    plans = _plan(files, NONE, allow_outside=allow_outside)
+    expected = _forecasts({plan.folder: _extent_of(plan) for plan in plans}).values()
+    fitting = [each.memory_mb * 1e6 for each in expected if each.least_memory_mb * 1e6 <= limit_bytes()]
+    return max(fitting, default=0.0)
 
 
 def _work(job: SurveyJob, survey: SurveyFile, comparers: Comparers) -> Work:

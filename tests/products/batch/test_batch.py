@@ -26,12 +26,13 @@ from rich.console import Console
 from threadpoolctl import threadpool_info, threadpool_limits
 
 from adapters.dask_cluster import DaskEngine, _event, _OneThread, fitting_workers, local_engine, remote_engine
+from sfm.cli.commands.batch import InProcess
 from sfm.files.open_folders import MANIFEST, Owner, locked, sha256_of
 from sfm.files.whole_files import write_manifest
 from sfm.model.errors import BackendError, OutputError, SurveyFileError
 from sfm.model.remarks.remark import kinds_of
 from sfm.products.batch.job import LOCK, SurveyJob, SurveyRow, note_finished, reconstruct
-from sfm.products.batch.run import calls_of, find_surveys, run_batch
+from sfm.products.batch.run import calls_of, find_surveys, memory_of, run_batch
 from sfm.products.batch.table import BatchTable, batch_page, batch_remarks
 from sfm.report.output import read_log
 from sfm.report.pages import html
@@ -188,6 +189,22 @@ def test_failures_are_rows_and_the_others_go_on(surveys: tuple[Path, ...], tmp_p
         assert log[-1]["event"] == "failed"
         assert log[-1]["reason"] == row.reason
     assert not [path for path in out.rglob("*.part")]
+
+
+def test_a_survey_that_cannot_fit_is_set_aside_before_it_starts(
+    surveys: tuple[Path, ...], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path / "cache"))
+    out = tmp_path / "out"
+    assert 3e8 < memory_of(surveys) < 1e9
+    with monkeypatch.context() as little:
+        little.setattr(InProcess, "call_bytes", 1e8)
+        notes = Notes()
+        (row,) = run_batch(surveys[:1], out, HERE, ALONE, notes)
+        assert row.status == "failed" and not notes.messages
+        assert "the survey needs about 0.4 GB of memory" in row.reason and "0.1 GB are there" in row.reason
+    (row,) = run_batch(surveys[:1], out, HERE, ALONE, Notes(), resume=True)
+    assert row.status == "done"
 
 
 def test_surveys_of_one_name_get_folders_of_their_own(tmp_path: Path) -> None:
@@ -377,6 +394,7 @@ def test_as_many_workers_as_have_something_to_do(surveys: tuple[Path, ...], tmp_
     assert calls_of(surveys) == 6 + 6 + 1
     assert calls_of([tmp_path / "none.toml"]) == 1
     assert 1 <= fitting_workers() <= (os.cpu_count() or 1)
+    assert fitting_workers(1e15) == 1
 
 
 def test_index_escapes_everything() -> None:
