@@ -67,6 +67,8 @@ class GivenTest:
     dof: int
     probability: float  # of such differences by chance
     others: int | None = None  # values that each is compared with if these have no standard deviations
+    judged: int | None = None  # values that are judged where these are only some of very many
+    given: int | None = None  # all of them, then
 
 
 @dataclass(frozen=True)

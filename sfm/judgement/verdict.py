@@ -390,6 +390,8 @@ def given_remarks(
             others=test.others,
             dof=test.dof,
             p=test.probability,
+            judged=test.judged,
+            given=test.given,
         )
         for test in result.given_tests
         if test.dof  # else nothing was tested

@@ -322,6 +322,17 @@ def test_very_many_photographs_are_tested_in_parts(a: Adjustment, monkeypatch: p
     monkeypatch.setattr(hypotheses, "MAX_PHOTOGRAPHS", 5)
     (one,) = judge_alternatives(a).unchecked
     assert one.kind == "assumptions_tested" and one.number("parts") == 1
+    assert "image point" not in one.text
+    count = len(a.network.image_points)
+    monkeypatch.setattr(hypotheses, "PART_IMAGE_POINTS", 60)
+    (of_parts,) = judge_alternatives(a).unchecked
+    monkeypatch.setattr(hypotheses, "MAX_PHOTOGRAPHS", 6)
+    monkeypatch.setattr(hypotheses, "MAX_IMAGE_POINTS", 60)
+    (of_whole,) = judge_alternatives(a).unchecked
+    for said in (of_parts, of_whole):
+        sample, total = said.number("sample"), said.number("image_points")
+        assert 60 <= sample < total <= count and f"with {sample:.0f} image points of {total:.0f}" in said.text
+    monkeypatch.setattr(hypotheses, "MAX_PHOTOGRAPHS", 5)
     monkeypatch.setattr(hypotheses, "free_network", None)  # is not asked for
     assert contradicted_parameters(a) == ()
 

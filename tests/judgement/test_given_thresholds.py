@@ -216,6 +216,11 @@ def test_all_rows_of_a_long_table_that_is_wrong_are_left_out(monkeypatch: pytest
     (said,) = of_kind(judged.remarks, "scale_left_out")
     assert said.names("given") == ("the table of distances",)
     assert judged.network.scale_bars.start.tolist() == [0, 3]
+    (test,) = judged.tests
+    assert (test.what, test.judged, test.given) == ("scale", 10, 30)
+    monkeypatch.setattr(free_network, "MAX_PLACES", 30)
+    (test,) = judge_given(network.with_given(bars), free, settings).tests
+    assert test.judged is test.given is None
 
 
 def test_a_wrong_bar_given_twice_does_not_outvote_a_right_one() -> None:

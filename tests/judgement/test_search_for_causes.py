@@ -321,7 +321,9 @@ def test_of_fewer_than_four_photographs_it_is_said_that_none_can_differ(
 ) -> None:
     monkeypatch.setattr(hypotheses, "find_causes", lambda _: ())
     monkeypatch.setattr(hypotheses, "unchecked_assumptions", lambda *_: ())
-    kinds = kinds_of(hypotheses._judge_free(of_photographs(a, count), "m", None).unchecked)
+    few = of_photographs(a, count)
+    judged = hypotheses._judge_free(few, "m", None, len(few.network.image_points))
+    kinds = kinds_of(judged.unchecked)
     assert ("photographs_untested" in kinds) == said and "assumptions_tested" in kinds
 
 
@@ -330,7 +332,8 @@ def test_what_is_not_determined_is_not_tested(a: Adjustment, monkeypatch: pytest
         raise np.linalg.LinAlgError
 
     monkeypatch.setattr(hypotheses, "find_causes", singular)
-    assert kinds_of(hypotheses._judge_free(a, "m", None).unchecked) == ("assumptions_untested",)
+    judged = hypotheses._judge_free(a, "m", None, len(a.network.image_points))
+    assert kinds_of(judged.unchecked) == ("assumptions_untested",)
     monkeypatch.setattr(hypotheses, "_best", singular)
     assert hypotheses.best_explanation(a) is None
 
@@ -432,7 +435,7 @@ def test_coordinates_that_are_all_given_shift_without_the_control_alone(
         )
     final = adjust(network, truth, datum=Datum("control" if points else "free"), reject="none")
     of = []
-    monkeypatch.setattr(hypotheses, "_judge_free", lambda _, __, of_what: of.append(of_what) or NOTHING)
+    monkeypatch.setattr(hypotheses, "_judge_free", lambda _, __, of_what, ___: of.append(of_what) or NOTHING)
     monkeypatch.setattr(hypotheses, "cause_in_calibration", lambda *_: None)
     judge_alternatives(final)
     assert of == [without]

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import cv2
 import numpy as np
@@ -23,6 +24,7 @@ from sfm.orientation.incremental.sequence import Orientation
 from sfm.orientation.resection.ransac import resect_robust
 from sfm.pipeline import run_survey
 from sfm.products.drafting.draft import draft_survey
+from sfm.survey.diagnosis import photograph_cameras
 from sfm.survey.diagnosis.photograph_cameras import SCALES, TOLERANCE
 from sfm.survey.inputs.cameras import start_cameras
 from sfm.survey.inputs.measurements import Measurements
@@ -127,6 +129,25 @@ def test_what_all_photographs_share_is_no_camera_of_one(kind: str, cause: str) -
     assert len(result.adjustment.estimate.cameras) == 1
     assert not of_kind(result.remarks, "camera_per_photograph")
     assert of_kind(result.remarks, cause)
+
+
+def test_in_a_large_network_parts_decide_what_all_photographs_share(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Above the size that is tested as a whole, as in a smaller one: in both ways."""
+    asked = list[int]()
+    explained = photograph_cameras._is_explained_otherwise
+
+    def noted(*arguments: Any) -> bool:
+        asked.append(int(arguments[5].sum()))
+        return explained(*arguments)
+
+    monkeypatch.setattr(photograph_cameras, "_is_explained_otherwise", noted)
+    monkeypatch.setattr(photograph_cameras, "MAX_PHOTOGRAPHS", 9)
+    monkeypatch.setattr(photograph_cameras, "PART_PHOTOGRAPHS", 8)
+    test_what_all_photographs_share_is_no_camera_of_one("autofocus", "camera_varies")
+    assert asked and max(asked) <= 8
+    asked.clear()
+    test_a_zoomed_photograph_gets_its_own_c(0.98)
+    assert asked and max(asked) <= 8
 
 
 def test_the_tolerance_is_that_of_half_a_step_of_c() -> None:

@@ -8,7 +8,7 @@ Source: Foerstner and Wrobel (2016), Photogrammetric Computer Vision, sec. 4.6 (
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sized
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -182,7 +182,8 @@ def _judged(task: Task) -> JudgedGiven:
     """Judge the given points, then the scales of bars and points."""
     network, datum = task.network, task.settings.datum
     seen = network.exterior if task.in_control else ExteriorObservations()
-    of_kinds = _group(task, "control", network.control), _group(task, "centres", seen.of_positions)
+    tables: dict[str, CoordinateKind] = {"control": network.control, "centres": seen.of_positions}
+    of_kinds = [_group(task, of, kind) for of, kind in tables.items()]
     groups = [group for group in of_kinds if group is not None]
     scales = judge_scales(task, [group for group in groups if group.dependable])
     used = [group for group in groups if not group.placed.mirrored and group.of not in scales.left_out]
@@ -203,10 +204,17 @@ def _judged(task: Task) -> JudgedGiven:
         network,
         datum,
         remarks,
-        tuple(group.test for group in groups) + scales.tests,
+        tuple(_with_count(group.test, tables[group.of]) for group in groups)
+        + tuple(_with_count(test, task.network.scale_bars) for test in scales.tests),
         next((group.placed.placing for group in used), None),
         any(group.checks_handedness for group in groups),
     )
+
+
+def _with_count(test: GivenTest, given: Sized) -> GivenTest:
+    """Return a test with the number of given values that are judged, where these are only some."""
+    judged = len(thinned(len(given)))
+    return test if judged == len(given) else replace(test, judged=judged, given=len(given))
 
 
 def _group(task: Task, of: str, kind: CoordinateKind) -> Group | None:

@@ -130,7 +130,7 @@ def judge_alternatives(final: Adjustment, *, unit: str = "") -> JudgedAssumption
     calibration = _is_calibration(final)
     without = "control" if calibration or not final.unknown_counts[2] else None
     free = free_network(final)
-    judged = _judge_free(free, unit, without)
+    judged = _judge_free(free, unit, without, len(final.network.image_points))
     if not calibration:
         return judged
     try:
@@ -145,7 +145,8 @@ def judge_alternatives(final: Adjustment, *, unit: str = "") -> JudgedAssumption
         for unchecked_remark in judged.unchecked
         if unchecked_remark.kind not in OF_FREE_POINTS
     )
-    tested = remark("assumptions_tested", photographs=photographs, causes=len(judged.causes))
+    sample = {} if free is None else _sample_of(len(free.network.image_points), len(final.rejected))
+    tested = remark("assumptions_tested", photographs=photographs, causes=len(judged.causes), **sample)
     return replace(judged, unchecked=(tested, *few, *unchecked))
 
 
@@ -173,6 +174,8 @@ def _judge_parts(final: Adjustment, unit: str) -> JudgedAssumptions:
     names = [[network.images[i] for i in np.flatnonzero(tested == which)] for which in (False, True)]
     if tested.any():
         size = {"parts": len(parts), "most": max(int(part.sum()) for part in parts)}
+        count = int((tested[network.image_points.image] & ~final.rejected).sum())
+        size |= _sample_of(sum(len(plain.network.image_points) for plain in solved), count)
         unchecked.append(remark("assumptions_tested", photographs=names[True], causes=len(said), **size))
     if not tested.all():
         unchecked.append(remark("photographs_untested", photographs=names[False], most=PART_PHOTOGRAPHS))
@@ -224,8 +227,18 @@ def _shared_by_parts(
     return [remark_of(plain, cause, unit, WITHOUT)] if cause.matters else []
 
 
-def _judge_free(plain: Adjustment | None, unit: str, without: str | None) -> JudgedAssumptions:
-    """Return the evidence of the image points alone; `plain` is None if they determine no network."""
+def _sample_of(tested: int, count: int) -> dict[str, int]:
+    """Return the numbers of tested and of all image points where those tested are a sample; else nothing."""
+    return {"sample": tested, "image_points": count} if tested < count else {}
+
+
+def _judge_free(
+    plain: Adjustment | None, unit: str, without: str | None, image_points: int
+) -> JudgedAssumptions:
+    """Return the evidence of the image points alone; `plain` is None if they determine no network.
+
+    They may be a sample of the number of image points that is given.
+    """
     if plain is None:
         return JudgedAssumptions(unchecked=(remark("assumptions_untested"),))
     photographs = plain.network.images
@@ -234,7 +247,8 @@ def _judge_free(plain: Adjustment | None, unit: str, without: str | None) -> Jud
         unchecked = unchecked_assumptions(plain, without)
     except np.linalg.LinAlgError:
         return JudgedAssumptions(unchecked=(remark("assumptions_untested"),))
-    tested = remark("assumptions_tested", photographs=photographs, causes=len(causes))
+    sample = _sample_of(len(plain.network.image_points), image_points)
+    tested = remark("assumptions_tested", photographs=photographs, causes=len(causes), **sample)
     unchecked = (tested, *unchecked)
     if len(photographs) < 2 * MIN_GROUP:
         few = remark("photographs_untested", photographs=photographs, needed=2 * MIN_GROUP)

@@ -27,7 +27,13 @@ from sfm.adjustment.datum import Datum
 from sfm.adjustment.quality.statistics import more_than_chance
 from sfm.adjustment.result import Adjustment
 from sfm.adjustment.solve import adjust
-from sfm.judgement.hypotheses.hypotheses import adjust_image_points, best_explanation
+from sfm.judgement.hypotheses.hypotheses import (
+    MAX_PHOTOGRAPHS,
+    PART_PHOTOGRAPHS,
+    adjust_image_points,
+    best_explanation,
+)
+from sfm.judgement.hypotheses.parts import MIN_RAYS, parts_of
 from sfm.judgement.hypotheses.refit import log_likelihood_of
 from sfm.judgement.model_choice import Choice, choose
 from sfm.model.camera import Camera, tangents_from_pixel
@@ -164,11 +170,37 @@ def _explained_otherwise(
 ) -> bool:
     """Return whether another cause makes the image points likelier than per-photograph cameras do.
 
+    A network of very many photographs is tested in parts: the cause must be likelier in each of those that
+    have a photograph with a camera of its own.
+
     own_network and own_estimate have the per-photograph cameras; kept photographs, (m,), are not left out.
     """
-    seen, images, points = network.image_points, kept & estimate.oriented, estimate.determined
-    rows = images[seen.image] & points[seen.point]
-    theirs = network.camera != own_network.camera
+    images, parts = kept & estimate.oriented, [kept & estimate.oriented]
+    if images.sum() > MAX_PHOTOGRAPHS:
+        seen, theirs = network.image_points, network.camera != own_network.camera
+        used = accepted & images[seen.image] & estimate.determined[seen.point]
+        parts = [part & images for part in parts_of(network, used, PART_PHOTOGRAPHS)]
+        parts = [part for part in parts if (part & theirs).any()]
+    return all(
+        _is_explained_otherwise(network, estimate, own_network, own_estimate, accepted, part, false_alarm)
+        for part in parts
+    )
+
+
+def _is_explained_otherwise(
+    network: Network,
+    estimate: Estimate,
+    own_network: Network,
+    own_estimate: Estimate,
+    accepted: BoolArray,
+    images: BoolArray,
+    false_alarm: float,
+) -> bool:
+    """Return whether another cause is likelier in some photographs, (m,)."""
+    seen, theirs = network.image_points, network.camera != own_network.camera
+    rows = images[seen.image] & estimate.determined[seen.point]
+    points = np.bincount(seen.point[rows], minlength=len(network.points)) >= MIN_RAYS
+    rows &= points[seen.point]
     start = ~accepted[rows]
     adjusted = [
         adjust_image_points(

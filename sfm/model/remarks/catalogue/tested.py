@@ -48,7 +48,8 @@ ROWS = (
     Tested(
         "assumptions_tested",
         "constant cameras and object",
-        "{photographs:photograph}[[, in {parts:part} of at most {most}]]",
+        "{photographs:photograph}[[, in {parts:part} of at most {most}]]"
+        "[[, with {sample:image point} of {image_points}]]",
         "{causes:contradiction}",
     ),
     Tested(
@@ -74,7 +75,7 @@ ROWS = (
     Tested(
         "given_tested",
         "given values against the image points",
-        "{of:@}",
+        "{of:@}[[, {judged} of {given} of them]]",
         "[[chi-square {chi2}, {dof} degrees of freedom, {p:<}]][[standard deviations not stated, each "
         "compared with {others} others, {p:<}]]",
     ),
