@@ -21,12 +21,14 @@ import argparse
 import resource
 import tempfile
 import time
+from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
 
 from benchmarks.networks import SIZE_PX, photographed, shared_camera
 from benchmarks.textured import covariance_on_centres, errors_before, joint_distance
+from sfm.judgement.survey_result import SurveyResult
 from sfm.model.conventions import FloatArray, IntArray
 from sfm.model.estimate import Estimate
 from sfm.model.network import Network
@@ -103,13 +105,30 @@ def walk(photographs: int, seed: int, *, closed: bool = True) -> tuple[Network, 
     return photographed(truth, seen, rng), truth
 
 
-def _run(network: Network, truth: Estimate) -> None:
-    """Run the survey of the image points and print its errors."""
+@dataclass(frozen=True)
+class Walked:
+    """Errors of the survey of a walk after a similarity onto the truth, object unit m."""
+
+    result: SurveyResult
+    oriented: int  # photographs
+    centres: float  # RMS error
+    predicted: float  # the same by the covariance
+    mahalanobis: float  # squared distance of all centres and rotations per degree of freedom
+    worst: float  # largest coordinate error of a centre, standard deviations
+    closure: FloatArray  # error of the vector between the last centre and the first, (3,)
+    closure_sigma: FloatArray  # its standard deviations, (3,)
+
+    @property
+    def closure_sigmas(self) -> float:
+        """Largest coordinate of the closure in standard deviations."""
+        return float(np.abs(self.closure / self.closure_sigma).max())
+
+
+def walked(network: Network, truth: Estimate) -> Walked:
+    """Run the survey of the image points of a walk and compare it with the truth."""
     with tempfile.TemporaryDirectory() as scratch:
         _write(Path(scratch), network)
-        begun = time.process_time()
         result = run_survey(read_survey(Path(scratch) / "survey.toml"), jobs=1)
-        seconds = time.process_time() - begun
     a = result.adjustment
     on = np.flatnonzero(a.estimate.oriented)
     of_truth: IntArray = np.array([int(a.network.images[i][1:-4]) for i in on])
@@ -120,23 +139,36 @@ def _run(network: Network, truth: Estimate) -> None:
     covariance = covariance_on_centres(a)
     distance = joint_distance(errors, covariance)
     errors, sigma = errors.ravel(), np.sqrt(np.diagonal(covariance))
-    z = errors / sigma
     order = np.argsort(of_truth)
     closing = np.zeros((3, 6 * m))
     closing[:, 6 * order[-1] : 6 * order[-1] + 3] = np.eye(3)
     closing[:, 6 * order[0] : 6 * order[0] + 3] = -np.eye(3)
-    closure = closing @ errors
-    of_closure = np.sqrt(np.diagonal(closing @ covariance @ closing.T))
-    mm = 1000 * moved.scale
-    off, predicted = (_rms(of.reshape(m, 6)[:, :3]) for of in (errors, sigma))
-    worst, memory = np.abs(z.reshape(m, 6)[:, :3]).max(), resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
+    off, predicted = (moved.scale * _rms(of.reshape(m, 6)[:, :3]) for of in (errors, sigma))
+    return Walked(
+        result,
+        m,
+        off,
+        predicted,
+        distance,
+        float(np.abs((errors / sigma).reshape(m, 6)[:, :3]).max()),
+        moved.scale * (closing @ errors),
+        moved.scale * np.sqrt(np.diagonal(closing @ covariance @ closing.T)),
+    )
+
+
+def _run(network: Network, truth: Estimate) -> None:
+    """Run the survey of the image points and print its errors."""
+    begun = time.process_time()
+    walk = walked(network, truth)
+    seconds, memory = time.process_time() - begun, resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
     print(
-        f"{len(truth.position):>11}{m:>10}{len(a.network.points):>9}{mm * off:>12.2f}{mm * predicted:>14.2f}"
-        f"{off / predicted:>7.2f}{distance:>17.2f}{worst:>20.2f}{mm * np.linalg.norm(closure):>12.2f}"
-        f"{np.abs(closure / of_closure).max():>15.2f}{seconds:>7.1f}{memory / 1024:>5.0f}",
+        f"{len(truth.position):>11}{walk.oriented:>10}{len(walk.result.adjustment.network.points):>9}"
+        f"{1000 * walk.centres:>12.2f}{1000 * walk.predicted:>14.2f}{walk.centres / walk.predicted:>7.2f}"
+        f"{walk.mahalanobis:>17.2f}{walk.worst:>20.2f}{1000 * np.linalg.norm(walk.closure):>12.2f}"
+        f"{walk.closure_sigmas:>15.2f}{seconds:>7.1f}{memory / 1024:>5.0f}",
         flush=True,
     )
-    for remark in result.remarks:
+    for remark in walk.result.remarks:
         print("   ", remark.kind, flush=True)
 
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import asyncio
 import json
+import math
 import os
 import signal
 import subprocess
@@ -24,8 +25,11 @@ from sfm.adjustment.engine.solvers.helmert import HelmertSolver
 from sfm.adjustment.result import Adjustment
 from sfm.model.conventions import FloatArray
 from sfm.model.errors import BackendError, KolinearError
+from sfm.products.batch.job import SurveyRow
+from sfm.products.batch.run import run_batch
 from sfm.runtime.executor import Blocking, Call, Keeper, KeptHere, in_blocks
 from tests.commands import kolinear, refused
+from tests.engines import ALONE, HERE, Notes, points_of
 from tests.places import ROOT
 from tests.surveys import observed_text, write_image_points, write_observed_survey
 from tests.synthetic_blocks import aerial, run, spoiled, unordered
@@ -262,3 +266,97 @@ def test_a_scheduler_that_is_killed_is_one_line_and_starting_again_gives_the_sam
 def test_a_worker_that_dies_of_a_block_again_and_again_is_one_line(two_workers: DaskEngine) -> None:
     with pytest.raises(BackendError, match="worker processes died, out of memory or by a fault"):
         two_workers.fetch([Call(signal.raise_signal, (signal.SIGKILL,))])
+
+
+@pytest.mark.slow
+def test_after_the_scheduler_of_a_batch_is_killed_a_resumed_batch_ends_with_the_same_results(
+    tmp_path: Path,
+) -> None:
+    surveys = [write_observed_survey(tmp_path / f"s{k}", f"s{k}") for k in range(3)]
+    run_batch(surveys, tmp_path / "undisturbed", HERE, ALONE, Notes())
+    out = tmp_path / "out"
+
+    class Killing(Notes):
+        """Kills the scheduler once the first survey is finished."""
+
+        def finished(self, name: str, row: SurveyRow, *, kept: bool) -> None:
+            super().finished(name, row, kept=kept)
+            scheduler.kill()
+
+    with (
+        scheduler_and_workers(tmp_path) as (address, scheduler),
+        remote_engine(address, "--cluster") as engine,
+    ):
+        engine.client.wait_for_workers(2, timeout=60)
+        with pytest.raises(
+            BackendError, match=r"the Dask scheduler is gone; run again with --resume|dropped"
+        ):
+            run_batch(surveys, out, nullcontext(engine), ALONE, Killing())
+    assert 1 <= len(points_of(out)) < 3
+    again = Notes()
+    with scheduler_and_workers(tmp_path) as (address, _), remote_engine(address, "--cluster") as engine:
+        engine.client.wait_for_workers(2, timeout=60)
+        rows = run_batch(surveys, out, nullcontext(engine), ALONE, again, resume=True)
+    assert [row.status for row in rows] == ["done"] * 3
+    assert {kept for _, kept in again.finished_rows} == {False, True}
+    assert points_of(out) == points_of(tmp_path / "undisturbed")
+
+
+class Scheduler:
+    """What a client says of its workers: their status, and whether they have work."""
+
+    def __init__(self, workers: dict[str, str], busy: set[str], status: str = "running") -> None:
+        self.workers, self.busy, self.status = workers, busy, status
+
+    def scheduler_info(self, *, n_workers: int) -> dict[str, Any]:
+        assert n_workers == -1  # of all workers, not of the first five
+        return {"workers": {address: {"status": status} for address, status in self.workers.items()}}
+
+    def processing(self) -> dict[str, tuple[str, ...]]:
+        return {address: ("call",) if address in self.busy else () for address in self.workers}
+
+
+@pytest.mark.parametrize(
+    ("workers", "busy", "message"),
+    [
+        ({"a": "paused", "b": "running"}, {"b"}, ""),
+        ({"a": "paused", "b": "paused"}, {"a", "b"}, "their memory is full, and nothing more can be moved"),
+        ({"a": "paused", "b": "running"}, {"a"}, "no worker of the cluster has worked for 60 s"),
+        ({}, set(), "has had no worker for 60 s"),
+    ],
+)
+def test_workers_that_are_full_are_waited_for_a_minute(
+    monkeypatch: pytest.MonkeyPatch, workers: dict[str, str], busy: set[str], message: str
+) -> None:
+    """A worker whose memory and disk are full is paused: it keeps its work, and does not begin it."""
+    now = 100.0
+    monkeypatch.setattr("adapters.dask_cluster.time.monotonic", lambda: now)
+    engine = DaskEngine(Scheduler(workers, busy))  # type: ignore[arg-type]
+    works = not message
+    assert engine._last_seen(now - 59.0, "again") == (now if works else now - 59.0)
+    if works:
+        assert engine._last_seen(now - 61.0, "again") == now
+        return
+    with pytest.raises(BackendError, match=message):
+        engine._last_seen(now - 61.0, "again")
+
+
+def test_a_call_may_take_the_memory_of_the_largest_worker() -> None:
+    scheduler = Scheduler({}, set())
+    engine = DaskEngine(scheduler)  # type: ignore[arg-type]
+    limits: list[int | None] = []
+    scheduler.scheduler_info = lambda n_workers: {  # type: ignore[method-assign, misc, assignment]
+        "workers": {str(k): {"memory_limit": limit} for k, limit in enumerate(limits)}
+    }
+    for limits[:], expected in (([], math.inf), ([2, 3], 3.0), ([2, 0], math.inf), ([2, None], math.inf)):
+        assert engine.call_bytes == expected
+
+
+def test_a_scheduler_that_does_not_answer_is_gone_at_once() -> None:
+    closed = DaskEngine(Scheduler({"a": "running"}, {"a"}, "closed"))  # type: ignore[arg-type]
+    with pytest.raises(BackendError, match="the Dask scheduler is gone; run it again"):
+        closed._last_seen(time.monotonic(), "run it again")
+    silent = Scheduler({"a": "running"}, {"a"})
+    silent.processing = lambda: (_ for _ in ()).throw(OSError())  # type: ignore[method-assign]
+    with pytest.raises(BackendError, match="the Dask scheduler is gone; run it again"):
+        DaskEngine(silent)._last_seen(time.monotonic(), "run it again")  # type: ignore[arg-type]

@@ -129,6 +129,27 @@ def test_batch_of_ten_survives_twenty_kills(tmp_path: Path) -> None:
     print(f"{killed} kills in {rounds} rounds")
 
 
+@pytest.mark.slow
+@pytest.mark.parametrize("command", ["run", "batch"])
+def test_after_a_full_disk_there_is_room_again_and_the_result_is_the_same(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, command: str
+) -> None:
+    """What the first run measured and could keep is read again."""
+    survey = write_photograph_survey(tmp_path / "s", "s")
+
+    def run(out: str, cache: str, *options: object, limit: int | None = None) -> int:
+        monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path / cache))
+        folder = tmp_path / out / "s" if command == "run" else tmp_path / out
+        return kolinear(command, survey, "--out", folder, "--jobs", 1, *options, limit=limit).returncode
+
+    assert run("undisturbed", "cache") == 0
+    assert run("disturbed", "other", limit=SMALL_FILE_BYTES) == 2
+    assert points_of(tmp_path / "disturbed") == {}
+    assert run("disturbed", "other", *(["--resume"] if command == "batch" else [])) == 0
+    assert points_of(tmp_path / "disturbed") == points_of(tmp_path / "undisturbed") != {}
+    assert names_in(tmp_path / "disturbed") == names_in(tmp_path / "undisturbed")
+
+
 @pytest.mark.parametrize(
     ("command", "left"),
     [
