@@ -191,9 +191,9 @@ def run_survey_file(survey_file: Path, options: RunOptions) -> Path:
             progress=log,
             plot_process=plots,
         )
-        if not revised and (store is None or not store.has_earlier):
-            memory = peak_bytes() / 1e6 if options.cluster is None else 0.0  # blocks are elsewhere
-            history.add(Run(work, drawn.finished(), memory))
+        alone = options.cluster is None  # else other computers measured, matched or adjusted
+        if alone and not revised and (store is None or not store.has_earlier):
+            history.add(Run(work, drawn.finished(), peak_bytes() / 1e6))
     seconds = time.perf_counter() - begun
     if options.product is not None:
         dependable = options.product.show(folder, pdf=options.pdf)
