@@ -233,8 +233,8 @@ def align_points(
         raise GeometryError(
             f"alignment: {counted(len(common), 'nominal point')} measured, a best fit needs 3"
         )
-    rows = np.array([points.index(name) for name in common], dtype=np.int64)
-    nominal_rows = np.array([nominal.names.index(name) for name in common], dtype=np.int64)
+    rows = points.indices(common)
+    nominal_rows = nominal.indices(common)
     target = nominal.xyz[nominal_rows]
     fixed = None if scale else 1.0
     if weights == "network" and points.covariance is None and nominal.covariance is None:

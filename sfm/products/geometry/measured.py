@@ -93,6 +93,11 @@ class MeasuredPoints:
         """Return the index of a point; UnknownNameError if no point has that name."""
         return index_of(self.names, name, "point")
 
+    def indices(self, names: Sequence[str]) -> IntArray:
+        """Return the indices of points, (k,); UnknownNameError if no point has one of the names."""
+        row_of = {name: k for k, name in reversed(list(enumerate(self.names)))}
+        return np.array([row_of[n] if n in row_of else self.index(n) for n in names], dtype=np.int64)
+
     def matching(self, patterns: Sequence[str], what: str) -> IntArray:
         """Return the indices of the points that match any of several names or patterns, in their order.
 
@@ -439,6 +444,6 @@ def coordinates_in(
 
     Source: law of propagation of covariances; Luhmann et al. (2020), sec. 2.4.
     """
-    rows = np.array([points.index(name) for name in names], dtype=np.int64)
+    rows = points.indices(names)
     value = scale * (points.xyz[rows] - origin) @ rotation
     return Function(value.ravel(), rows, np.asarray(scale * np.kron(np.eye(len(rows)), rotation.T)))

@@ -92,8 +92,8 @@ def deviations_from_points(
     common = [name for name in nominal.names if name in points.names and name in wanted]
     if not common:
         raise GeometryError(f"tolerance {tolerance.name}: no nominal point was measured")
-    rows = np.array([points.index(name) for name in common], dtype=np.int64)
-    of_nominal = np.array([nominal.names.index(name) for name in common], dtype=np.int64)
+    rows = points.indices(common)
+    of_nominal = nominal.indices(common)
     d = points.xyz[rows] - nominal.xyz[of_nominal]
     Q = points.blocks[rows]
     if nominal.covariance is not None:

@@ -114,7 +114,8 @@ def match_marks(
     scene = _scene_of(oriented)
     index = {name: i for i, name in enumerate(whole.images)}
     image = np.array([index[name] for name in part.images], dtype=np.int64)
-    point = np.array([points.index(name) for name in part.points], dtype=np.int64)
+    row_of = {name: k for k, name in enumerate(points)}
+    point = np.array([row_of[name] for name in part.points], dtype=np.int64)
     known = np.full((len(points), 3), np.nan)
     known[point] = start.estimate.points
     seen = part.image_points

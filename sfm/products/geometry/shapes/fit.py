@@ -152,7 +152,7 @@ def fit_shape(
     elif all(isinstance(name, str) for name in chosen) and not set(chosen) <= set(points.names):
         rows = points.matching(chosen, f"{what}: points")
     else:
-        rows = np.array([points.index(name) for name in chosen], dtype=np.int64)
+        rows = points.indices(chosen)
     try:
         return _fit(points, KINDS[kind], rows, name or kind, weights, dict(hold or {}), robust, offset)
     except GeometryError as error:
