@@ -42,6 +42,7 @@ from sfm.survey.inputs.exterior_table import ObservedExterior as ObservedExterio
 from sfm.survey.inputs.given_values import KnownPoints as KnownPoints
 from sfm.survey.inputs.given_values import Observations as Observations
 from sfm.survey.inputs.given_values import ScaleBar as ScaleBar
+from sfm.survey.inputs.pair_list import PairList as PairList
 from sfm.survey.inputs.survey import CameraSetup as CameraSetup
 from sfm.survey.inputs.survey import Survey as Survey
 from sfm.survey.inputs.survey import read_survey as read_survey

@@ -244,7 +244,7 @@ def array_table(
     names = tuple(
         _names(name, list(map(str, column)), f"{what}, {word}", places) for name, column in texts.items()
     )
-    values = np.column_stack(list(numbers.values()))
+    values = np.column_stack([np.zeros((rows, 0)), *numbers.values()])
     table = CsvTable(Path(what), tuple(texts), names, values, np.array(places), word, tuple(numbers))
     wrong = ~(np.abs(values) <= MAX_NUMBER)
     wrong &= ~(np.isnan(values) & np.isin(list(numbers), blank))

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from collections.abc import Sequence
 from dataclasses import replace
 from datetime import datetime, timedelta
@@ -13,14 +14,26 @@ import numpy as np
 import pytest
 
 from sfm.matching.tracks.feature_tracks import TiePoints, find_tie_points
+from sfm.matching.tracks.matched_pairs import MatchedPairs
 from sfm.model.conventions import IntArray
+from sfm.model.errors import SurveyFileError
 from sfm.model.remarks.remark import of_kind
 from sfm.photographs.exif import Metadata, SatellitePosition
+from sfm.pipeline import run_survey
+from sfm.survey.inputs.cameras import start_cameras
+from sfm.survey.inputs.exterior_table import ObservedExterior
+from sfm.survey.inputs.given_values import StartOrientations
 from sfm.survey.inputs.measurements import find_photographs
 from sfm.survey.inputs.settings import TiePointSettings
-from sfm.survey.inputs.survey import CameraSetup, Survey
+from sfm.survey.inputs.survey import CameraSetup, Survey, read_survey
 from sfm.survey.measuring import tie_points
-from sfm.survey.measuring.tie_points import NONE, neighbours_by_position, neighbours_in_sequence
+from sfm.survey.measuring.neighbours import (
+    NONE,
+    given_exterior,
+    neighbours_by_position,
+    neighbours_in_sequence,
+    neighbours_in_view,
+)
 from tests.satellite import state_position
 from tests.synthetic import seed_of
 from tests.textures import natural_texture
@@ -101,17 +114,67 @@ def test_heights_tell_neighbours_on_a_façade() -> None:
     assert neighbours_by_position([at(0, 0), at(200, 0)], 2).tolist() == [[1, NONE], [0, NONE]]
 
 
+def flown(angles_deg: np.ndarray, position: np.ndarray, *, approximate: bool = False) -> IntArray:
+    """Return the neighbours of photographs whose exterior orientation is given."""
+    names = tuple(f"{k}.jpg" for k in range(len(position)))
+    setup = CameraSetup(name="one", images="*.jpg", size_px=(400, 300), pixel_mm=(0.01, 0.01), c_mm=4.0)
+    given: dict[str, Any] = {"exterior": ObservedExterior.from_arrays(names, position, 0.1, angles_deg)}
+    if approximate:
+        given = {"start_orientations": StartOrientations.from_arrays(names, position, angles_deg)}
+    survey = Survey(name="flown", cameras=(setup,), tie_points=TiePointSettings(), **given)
+    cameras = start_cameras(survey.cameras, "flown")
+    exterior = given_exterior(survey, names, cameras)
+    return neighbours_in_view(exterior, np.zeros(len(names), dtype=np.int64), 6)
+
+
+@pytest.mark.parametrize("approximate", [False, True])
+def test_neighbours_in_a_flown_block_look_at_the_same_ground(approximate: bool) -> None:
+    """Two flights of 4 x 6 photographs 10 m apart, 40 m above ground: one looks down, one up and sideways."""
+    x, y = (a.ravel() for a in np.meshgrid(10.0 * np.arange(6), 10.0 * np.arange(4)))
+    position = np.column_stack([x, y, np.full(24, 40.0)])
+    down, away = np.zeros((24, 3)), np.tile([110.0, 0.0, 0.0], (24, 1))
+    near = flown(np.vstack([down, away]), np.vstack([position, position + 0.5]), approximate=approximate)
+    assert (near[:24] < 24).all() and {6, 8, 1, 13} <= set(near[7])
+    assert (near[24:] >= 24).sum() + (near[24:] == NONE).sum() == near[24:].size
+    assert (near[24:] >= 24).any()
+
+
+def test_oblique_photographs_have_the_neighbours_of_their_footprint() -> None:
+    """A photograph from aside, 40 m off, looks at the middle of a strip; the one beside it looks away."""
+    strip = np.column_stack([10.0 * np.arange(12), np.zeros(12), np.full(12, 40.0)])
+    position = np.vstack([strip, [[55.0, -40.0, 40.0], [55.0, -41.0, 40.0]]])
+    angles = np.zeros((14, 3))
+    angles[12:, 0] = [45.0, -45.0]
+    near = flown(angles, position)
+    assert set(near[12, :4]) <= set(range(3, 9)) and 13 not in near[12]
+    assert 12 not in near[13]
+
+
+def test_positions_alone_give_the_nearest_ones() -> None:
+    position = np.column_stack([10.0 * np.arange(12), np.zeros((12, 2))])
+    near = flown(np.full((12, 3), np.nan), position)
+    assert set(near[5, :2]) == {4, 6} and set(near[0]) == {1, 2, 3, 4, 5, 6}
+    assert (flown(np.zeros((4, 3)), np.zeros((4, 3))) == NONE).all()
+
+
+def write_strip(folder: Path, m: int) -> None:
+    """Write m photographs along a strip, each moved by an eighth of its width."""
+    step = 24
+    strip = natural_texture(seed_of("strip of photographs"), (192 + m * step, 144))
+    for k in range(m):
+        part = np.clip(strip[:, k * step : k * step + 192], 0, 255).astype(np.uint8)
+        cv2.imwrite(str(folder / f"p{k:02d}.png"), part)
+
+
 def test_the_survey_matches_neighbours_and_states_its_pairs(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """Photographs along a strip, each moved by an eighth of its width; the last third states positions."""
-    m, step = 18, 24
-    strip = natural_texture(seed_of("strip of photographs"), (192 + m * step, 144))
-    for k in range(m):
-        path = tmp_path / f"p{k:02d}.png"
-        cv2.imwrite(str(path), np.clip(strip[:, k * step : k * step + 192], 0, 255).astype(np.uint8))
-        if k >= 12:
-            state_position(path, SatellitePosition(0.001 * k, 7.0, 30.0, (np.nan,) * 3))
+    m = 18
+    write_strip(tmp_path, m)
+    for k in range(12, m):
+        position = SatellitePosition(0.001 * k, 7.0, 30.0, (np.nan,) * 3)
+        state_position(tmp_path / f"p{k:02d}.png", position)
     camera = CameraSetup(name="one", images="p*.png", pixel_mm=(0.01, 0.01), c_mm=2.0)
     survey = Survey(name="strip", cameras=(camera,), tie_points=TiePointSettings(), folder=tmp_path)
     used: list[Sequence[IntArray]] = []
@@ -122,9 +185,70 @@ def test_the_survey_matches_neighbours_and_states_its_pairs(
 
     monkeypatch.setattr(tie_points, "find_tie_points", find)
     measured = tie_points.tie_photographs(survey, find_photographs(survey))
-    by_position, in_sequence = used[0]
+    by_position, in_sequence, in_view = used[0]
+    assert (in_view == NONE).all()
     assert (by_position[:12] == NONE).all() and set(by_position[14, :2]) == {13, 15}
     assert in_sequence[5, :4].tolist() == [6, 4, 7, 3]
     (found,) = of_kind(measured.remarks, "pairs_matched")
     assert found.number("possible") == m * (m - 1) / 2 > found.number("pairs") >= 10 * m / 2
     assert (found.number("by_position"), found.number("in_sequence")) == (6, m)
+
+
+STRIP = """\
+[survey]
+name = "strip"
+unit = "m"
+[[camera]]
+name = "one"
+images = "p*.png"
+pixel_mm = [0.01, 0.01]
+c_mm = 2.0
+[tie_points]
+pairs = "pairs.csv"
+"""
+
+
+def test_the_pairs_of_a_list_are_the_only_ones(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """In either order; that of photographs without a common part is tried, and no other connects them."""
+    write_strip(tmp_path, 16)
+    (tmp_path / "survey.toml").write_text(STRIP, encoding="utf-8")
+    listed = [(k, k + step) for step in (1, 2) for k in range(16 - step) if (k, k + step) != (7, 8)]
+    lines = [f"p{b:02d}.png,p{a:02d}.png" for a, b in [*listed, (0, 15)]]
+    (tmp_path / "pairs.csv").write_text("\n".join(["image,other", *lines]) + "\n", encoding="utf-8")
+    survey = read_survey(tmp_path / "survey.toml")
+    used: list[set[tuple[int, int]]] = []
+
+    def find(*arguments: Any, known: MatchedPairs, **options: Any) -> TiePoints:
+        tied = find_tie_points(*arguments, known=known, **options)
+        used.append(set(known.known))
+        return tied
+
+    monkeypatch.setattr(tie_points, "find_tie_points", find)
+    measured = tie_points.tie_photographs(survey, find_photographs(survey))
+    assert used[-1] == {*listed, (0, 15)}
+    (found,) = of_kind(measured.remarks, "pairs_matched")
+    assert found.number("pairs") == len(lines) and "the pairs of the given list" in found.text
+    assert (np.bincount(measured.network.image_points.image) > 0).all()
+
+
+@pytest.mark.parametrize(
+    ("rows", "message"),
+    [
+        (["p00.png,p00.png"], "pairs.csv, line 2: image 'p00.png' twice, a pair has two photographs"),
+        (
+            ["p00.png,p01.png", "p01.png,p00.png"],
+            "pairs.csv, line 3: image 'p00.png', other 'p01.png' is on line 2 already",
+        ),
+        (
+            ["p00.png,p9.png"],
+            "pairs.csv, line 2: column other: 'p9.png' is no photograph of the survey; correct the name",
+        ),
+        ([], "pairs.csv: no rows below the header, at least one is needed"),
+    ],
+)
+def test_a_list_that_cannot_be_is_one_line(tmp_path: Path, rows: list[str], message: str) -> None:
+    write_strip(tmp_path, 3)
+    (tmp_path / "survey.toml").write_text(STRIP, encoding="utf-8")
+    (tmp_path / "pairs.csv").write_text("\n".join(["image,other", *rows]) + "\n", encoding="utf-8")
+    with pytest.raises(SurveyFileError, match=re.escape(message)):
+        run_survey(read_survey(tmp_path / "survey.toml"))

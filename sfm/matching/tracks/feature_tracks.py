@@ -93,6 +93,7 @@ def find_tie_points(
     threads: int = 1,
     known: MatchedPairs | None = None,
     neighbours: Sequence[IntArray] = (),
+    pairs: IntArray | None = None,
 ) -> TiePoints:
     """Find and measure points common to several photographs, without any knowledge of their orientation.
 
@@ -104,6 +105,7 @@ def find_tie_points(
         threads: number of pairs of photographs matched at the same time.
         known: see `link_features`.
         neighbours: see `link_features`.
+        pairs: see `link_features`.
 
     Returns:
         The tie points; n may be 0.
@@ -123,7 +125,13 @@ def find_tie_points(
     if settings.min_image_points:
         fewest = min(2, fewest)
     tracks = link_features(
-        natural, min_rays=fewest, seed=seed, threads=threads, known=known, neighbours=neighbours
+        natural,
+        min_rays=fewest,
+        seed=seed,
+        threads=threads,
+        known=known,
+        neighbours=neighbours,
+        pairs=pairs,
     )
     kept = _needed(tracks.image, tracks.point, m, settings)
     _, point = np.unique(tracks.point[kept], return_inverse=True)
@@ -154,6 +162,7 @@ def link_features(
     threads: int = 1,
     known: MatchedPairs | None = None,
     neighbours: Sequence[IntArray] = (),
+    pairs: IntArray | None = None,
 ) -> Tracks:
     """Match the features of overlapping photographs and combine the features that belong to one point.
 
@@ -170,22 +179,26 @@ def link_features(
         threads: number of pairs compared and matched at the same time.
         known: matches of pairs of photographs that need not be matched again; new matches are added to them.
         neighbours: photographs taken near each photograph, see `overlapping_pairs`.
+        pairs: the only pairs of photographs that are matched, i < j, (p, 2); those that overlap if not given.
     """
     known = MatchedPairs() if known is None else known
     first = np.concatenate([[0], np.cumsum([len(of_photograph) for of_photograph in features])]).astype(
         np.int64
     )
-    compared = compare_photographs(features, neighbours=neighbours, seed=seed, threads=threads)
-    pairs = overlapping_pairs(compared, neighbours=neighbours)
 
     def match(of: IntArray) -> _MatchedFeatures:
         return _matched_features(known.add(features, of, seed=seed, threads=threads), features, first)
 
-    matched = match(pairs)
-    part = connected_parts(pairs[np.unique(matched.pair)], len(features))
-    if part.max(initial=0):
-        compared = compare_parts(features, compared, part, seed=seed, threads=threads)
-        matched = match(np.concatenate([pairs, connecting_pairs(compared, part, pairs)]))
+    if pairs is not None:
+        matched = match(pairs)
+    else:
+        compared = compare_photographs(features, neighbours=neighbours, seed=seed, threads=threads)
+        overlapping = overlapping_pairs(compared, neighbours=neighbours)
+        matched = match(overlapping)
+        part = connected_parts(overlapping[np.unique(matched.pair)], len(features))
+        if part.max(initial=0):
+            compared = compare_parts(features, compared, part, seed=seed, threads=threads)
+            matched = match(np.concatenate([overlapping, connecting_pairs(compared, part, overlapping)]))
     image = np.repeat(np.arange(len(features)), np.diff(first))
     edge = matched.edge[np.argsort(-matched.distinct, kind="stable")]
     group = joined_features(edge, image, len(features))

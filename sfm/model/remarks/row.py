@@ -52,6 +52,8 @@ NOUNS = {  # subjects of remarks, by their names in the data
     "bars": "the scale bars",
     "cameras": "Interior parameters",
     "centres": "the projection centres",
+    "in common": "pairs with most in common",
+    "listed": "the pairs of the given list",
     "control": "the control points",
     "coordinates": "Coordinates",
     "coordinates without control": "Coordinates of the network without the control points",

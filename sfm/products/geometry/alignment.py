@@ -13,6 +13,7 @@ Photogrammetry and 3D Imaging, secs. 2.2.4 and 6.2.3; Horn (1987) for the start 
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -135,6 +136,11 @@ class Nominal:
     xyz: FloatArray  # object unit, (n, 3)
     covariance: FloatArray | None = None  # of each point, object unit^2; None for exact points, (n, 3, 3)
 
+    def indices(self, names: Sequence[str]) -> IntArray:
+        """Return the indices of names, which it has, (k,)."""
+        row_of = {name: k for k, name in enumerate(self.names)}
+        return np.array([row_of[name] for name in names], dtype=np.int64)
+
 
 @checked_arguments()
 def align_321(points: MeasuredPoints, plane: list[str], line: list[str], origin: str) -> Alignment:
@@ -228,7 +234,8 @@ def align_points(
 
     Source: Horn (1987), J. Opt. Soc. Am. A 4(4); Caspary (2000), sec. 7, for both covariances.
     """
-    common = [name for name in nominal.names if name in points.names]
+    measured = set(points.names)
+    common = [name for name in nominal.names if name in measured]
     if len(common) < 3:
         raise GeometryError(
             f"alignment: {counted(len(common), 'nominal point')} measured, a best fit needs 3"

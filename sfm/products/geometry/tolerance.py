@@ -89,7 +89,7 @@ def deviations_from_points(
     if chosen is not None:
         check_indices("deviations_from_points: chosen", chosen, len(points.names))
     wanted = set(points.names if chosen is None else [points.names[j] for j in chosen])
-    common = [name for name in nominal.names if name in points.names and name in wanted]
+    common = [name for name in nominal.names if name in wanted]
     if not common:
         raise GeometryError(f"tolerance {tolerance.name}: no nominal point was measured")
     rows = points.indices(common)

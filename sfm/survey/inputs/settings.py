@@ -240,6 +240,7 @@ class TiePointSettings(Section):
     max_points: Annotated[int, Field(ge=100, le=100_000)] = (
         6000  # in each photograph, spread over its texture
     )
+    pairs: FileOrNone = None  # a table image,other of the only pairs of photographs that are matched
 
 
 class DatumSettings(Section):

@@ -37,6 +37,14 @@ def refuse_unknown_photographs(survey: Survey, images: Sequence[str]) -> None:
                 raise SurveyFileError(
                     f"{given.table.place(k)}: {what} '{name}' {lacks}; correct the name or remove it"
                 )
+    if survey.pairs is not None:
+        for k, pair in enumerate(survey.pairs.names):
+            for column, name in zip(survey.pairs.table.names, pair, strict=True):
+                if name not in known:
+                    raise SurveyFileError(
+                        f"{survey.pairs.table.place(k)}: column {column}: '{name}' {lacks}; correct the name "
+                        "or remove it"
+                    )
 
 
 def start_values(survey: Survey, network: Network, cameras: tuple[Camera, ...]) -> Estimate:

@@ -48,6 +48,7 @@ from sfm.survey.inputs.given_values import (
 )
 from sfm.survey.inputs.ground_control import GroundControl, read_ground_control
 from sfm.survey.inputs.marks_file import Mark, Marking, image_points_of, read_marks
+from sfm.survey.inputs.pair_list import PairList, read_pairs
 from sfm.survey.inputs.settings import (
     AdjustSettings,
     CameraSettings,
@@ -112,6 +113,7 @@ class Survey:
     targets: TargetSettings = field(default_factory=TargetSettings)
     plates: tuple[PlateSettings, ...] = ()  # calibration plates besides the plate of the targets
     tie_points: TiePointSettings | None = None  # natural texture, beside targets if these have codes
+    pairs: PairList | None = None  # the only pairs in which it is matched; else those that overlap
     datum: DatumSettings = field(default_factory=DatumSettings)  # or a `Datum` with points by name
     adjust: AdjustSettings = field(default_factory=AdjustSettings)  # the stochastic model
     compare: CompareSettings = field(default_factory=CompareSettings)  # other programs to compare with
@@ -317,6 +319,7 @@ def survey_of_file(file: SurveyFile) -> Survey:
         targets=file.targets,
         plates=file.plates,
         tie_points=file.tie_points,
+        pairs=read(read_pairs, None if file.tie_points is None else file.tie_points.pairs),
         datum=file.datum,
         adjust=file.adjust,
         compare=file.compare,

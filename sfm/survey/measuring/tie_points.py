@@ -6,14 +6,11 @@ few tie points are searched again for more features.
 
 from __future__ import annotations
 
-import re
 from collections.abc import Sequence
 from dataclasses import replace
-from datetime import datetime
-from pathlib import Path, PurePosixPath
+from pathlib import Path
 
 import numpy as np
-from scipy.spatial import cKDTree
 
 from sfm.judgement.survey_result import PhotographTargets
 from sfm.matching.radiometry import full_scale, grey_of
@@ -26,12 +23,13 @@ from sfm.model.conventions import BoolArray, FloatArray, IntArray
 from sfm.model.errors import GeometryError
 from sfm.model.network import ImagePoints, Network, rows_of
 from sfm.model.remarks.remark import Remark, remark
-from sfm.photographs.exif import USUAL_SIGMAS_M, Metadata, local_coordinates, read_metadata
+from sfm.photographs.exif import Metadata, read_metadata
 from sfm.photographs.masks import Masks
 from sfm.photographs.reading import PhotographFiles, read_photograph
 from sfm.runtime.progress import SILENT, Progress, reported
 from sfm.survey.inputs.cameras import start_cameras
 from sfm.survey.inputs.measurements import Measurements, PhotographList
+from sfm.survey.inputs.pair_list import PairList
 from sfm.survey.inputs.settings import TiePointSettings
 from sfm.survey.inputs.start import network_of
 from sfm.survey.inputs.survey import Survey
@@ -42,13 +40,15 @@ from sfm.survey.measuring.measured_store import (
     content_hash,
     measured_once,
 )
+from sfm.survey.measuring.neighbours import (
+    given_exterior,
+    neighbours_by_position,
+    neighbours_in_sequence,
+    neighbours_in_view,
+)
 from sfm.survey.measuring.targets import each_photograph
 from sfm.targets.outlines import estimate_noise
 
-NONE = -1  # no photograph
-# Median distance from the median position, in standard deviations, beyond which positions differ by more than
-# their errors: errors alone give 1.5 (three axes).
-MIN_SPREAD_SIGMAS = 2.0
 # A photograph with fewer image points is searched for more features, if it has more in common with another
 # one than chance gives: at most 14 pairs of 2,000 features of different textures choose each other. Three
 # photographs of a portal, taken while walking towards it, have 36 tie points in common with 2,000 features
@@ -113,7 +113,9 @@ def tie_photographs(
     neighbours = (
         neighbours_by_position(metadata, PARTNERS),
         neighbours_in_sequence(names, metadata, PARTNERS),
+        neighbours_in_view(given_exterior(survey, names, cameras), camera, PARTNERS),
     )
+    pairs = None if survey.pairs is None else _listed_pairs(survey.pairs, names)
     matched = MatchedPairs(store=None if store is None else StoredMatches(store))
 
     def tie(min_image_points: int) -> TiePoints:
@@ -123,6 +125,7 @@ def tie_photographs(
             threads=jobs,
             known=matched,
             neighbours=neighbours,
+            pairs=pairs,
             settings=TrackSettings(
                 window_px=settings.window_px,
                 min_rays=min(MIN_RAYS, len(read)),
@@ -167,8 +170,17 @@ def tie_photographs(
         failed,
         tuple(replace(overlay, stored=detected[k][2]) for k, overlay in zip(read, drawn, strict=True)),
         files,
-        remarks=_remarks_on_matching(len(matched.known), neighbours, tied.still, names),
+        remarks=_remarks_on_matching(
+            len(matched.known), neighbours if pairs is None else None, tied.still, names
+        ),
     )
+
+
+def _listed_pairs(pairs: PairList, names: Sequence[str]) -> IntArray:
+    """Return the pairs of a list whose photographs were both read, i < j, sorted, (p, 2)."""
+    index = {name: i for i, name in enumerate(names)}
+    listed = [(index[a], index[b]) for a, b in pairs.names if a in index and b in index]
+    return np.unique(np.sort(np.array(listed, dtype=np.int64).reshape(-1, 2), axis=1), axis=0)
 
 
 def _shown_tie_points(tied: TiePoints, shown: BoolArray) -> TiePoints:
@@ -187,25 +199,21 @@ def _shown_tie_points(tied: TiePoints, shown: BoolArray) -> TiePoints:
 
 
 def _remarks_on_matching(
-    pairs: int, neighbours: Sequence[IntArray], still: FloatArray, names: Sequence[str]
+    pairs: int, neighbours: Sequence[IntArray] | None, still: FloatArray, names: Sequence[str]
 ) -> tuple[Remark, ...]:
     """Return the remarks on matched pairs, if these are not all pairs, and on features that stand still.
 
+    neighbours: by position, in sequence and in view, (m, k) each; None if the pairs are those of a list.
     still: share of such features in each photograph, (m,).
     """
     remarks = []
     possible = len(names) * (len(names) - 1) // 2
     if pairs != possible:
-        by_position, in_sequence = (int((near >= 0).any(axis=1).sum()) or None for near in neighbours)
-        remarks.append(
-            remark(
-                "pairs_matched",
-                pairs=pairs,
-                possible=possible,
-                by_position=by_position,
-                in_sequence=in_sequence,
-            )
-        )
+        ways = ("by_position", "in_sequence", "by_exterior")
+        used = dict(zip(ways, neighbours or (), strict=neighbours is not None))
+        counts = {way: int((near >= 0).any(axis=1).sum()) or None for way, near in used.items()}
+        how = ("in common" if neighbours else "listed",)
+        remarks.append(remark("pairs_matched", pairs=pairs, possible=possible, how=how, **counts))
     there = np.flatnonzero(still >= STILL_SHARE)
     if len(there):
         share = float(np.median(still[there]))
@@ -268,67 +276,3 @@ def natural_points_of(
         )
 
     return measured_once(store, path, TEXTURE, stated, measured)
-
-
-def neighbours_by_position(metadata: Sequence[Metadata], count: int) -> IntArray:
-    """Return the nearest photographs of each photograph, nearest first, padded with NONE, (m, k).
-
-    EXIF positions are compared in units of their standard deviations. If they differ by no more than their
-    errors, they say nothing, and no photograph has neighbours.
-
-    Args:
-        metadata: metadata of m photographs; some may have no position.
-        count: number of neighbours, k.
-    """
-    neighbours = np.full((len(metadata), count), NONE)
-    rows = np.array(
-        [k for k, photograph in enumerate(metadata) if photograph.position is not None], dtype=np.int64
-    )
-    positions = [photograph.position for photograph in metadata if photograph.position is not None]
-    if len(positions) < 2:
-        return neighbours
-    _, places = local_coordinates(positions)
-    sigma = np.array([position.sigma_m for position in positions])
-    places /= np.median(np.where(np.isnan(sigma), USUAL_SIGMAS_M, sigma), axis=0)
-    up = places[:, 2]
-    up[np.isnan(up)] = np.median(up[~np.isnan(up)]) if not np.isnan(up).all() else 0.0
-    if np.median(np.linalg.norm(places - np.median(places, axis=0), axis=1)) < MIN_SPREAD_SIGMAS:
-        return neighbours
-    nearest = min(count + 1, len(rows))
-    order = np.atleast_2d(cKDTree(places).query(places, nearest)[1])
-    for k, others in enumerate(order):
-        closest = others[others != k][:count]
-        neighbours[rows[k], : len(closest)] = rows[closest]
-    return neighbours
-
-
-def neighbours_in_sequence(names: Sequence[str], metadata: Sequence[Metadata], count: int) -> IntArray:
-    """Return the photographs taken before and after each photograph, NONE at the ends of a series, (m, k).
-
-    A series consists of photographs of one camera with an EXIF time. Without times it consists of photographs
-    whose names differ only in numbers. Photographs of the same time are sorted by the numbers in their names.
-
-    Args:
-        names: unique names of m photographs.
-        metadata: metadata of these photographs.
-        count: number of neighbours, k, even: half of them before, half after; the nearest first.
-    """
-    series: dict[tuple[object, ...], list[int]] = {}
-    for k, photograph in enumerate(metadata):
-        camera = (photograph.make, photograph.model, photograph.serial, PurePosixPath(names[k]).parent)
-        by_name = re.sub(r"\d+", "0", names[k]) if photograph.taken is None else ""
-        series.setdefault((*camera, by_name), []).append(k)
-
-    def moment(k: int) -> tuple[datetime, list[int], str]:
-        numbers = [int(digits) for digits in re.findall(r"\d+", names[k])]
-        return metadata[k].taken or datetime.min, numbers, names[k]
-
-    neighbours = np.full((len(names), count), NONE)
-    for members in series.values():
-        ordered = np.array(sorted(members, key=moment))
-        for column, offset in enumerate(step for k in range(1, count // 2 + 1) for step in (k, -k)):
-            from_, to = (
-                (ordered[:-offset], ordered[offset:]) if offset > 0 else (ordered[-offset:], ordered[:offset])
-            )
-            neighbours[from_, column] = to
-    return neighbours

@@ -115,8 +115,9 @@ ROWS = (
         "pairs_matched",
         "common points",
         "{pairs} of {possible} pairs of photographs",
-        "pairs with most in common[[, neighbours in the series of {in_sequence:photograph} (EXIF time or "
-        "numbers in the names)]][[, neighbours by satellite navigation of {by_position:photograph} (EXIF)]]",
+        "{how:@}[[, neighbours in the series of {in_sequence:photograph} (EXIF time or "
+        "numbers in the names)]][[, neighbours by satellite navigation of {by_position:photograph} (EXIF)]]"
+        "[[, neighbours by given exterior orientation of {by_exterior:photograph}]]",
     ),
     Tested(
         "adjuster_fits_alike",
