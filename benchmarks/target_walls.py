@@ -7,9 +7,10 @@ image points are found by the orientation. Photographs (640 x 480 px, rendered) 
 from both sides and from above and below, every other one turned, so that a target has about ten rays. They
 are kept in --work.
 
-Printed are oriented photographs, points and rays; the RMS error of the coded targets after a similarity onto
-the truth, what the adjustment predicts with a free datum, and their ratio; the processor time, that of each
-stage, and the peak memory. With several numbers of photographs, the exponents of growth are printed too.
+Printed are oriented photographs, points and rays; the RMS error of the projection centres after a similarity
+onto the truth, its prediction in the same datum, and their ratio; the joint squared Mahalanobis distance of
+centres and rotations per degree of freedom; the processor time, that of each stage, and the peak memory. With
+several numbers of photographs, the exponents of growth are printed too.
 """
 
 from __future__ import annotations
@@ -23,6 +24,7 @@ from pathlib import Path
 import cv2
 import numpy as np
 
+from benchmarks.textured import covariance_on_centres, errors_before, joint_distance
 from sfm.model.camera import Camera, camera_from_values
 from sfm.model.conventions import FloatArray, IntArray
 from sfm.model.similarity import fit_similarity
@@ -66,7 +68,7 @@ codes = "{CODES}"
 backend = "none"
 """
 HEAD = (
-    "photographs  oriented  points    rays  error mm  predicted mm  error/sigma"
+    "photographs  oriented  points    rays   centres mm  predicted mm  ratio  Mahalanobis/dof"
     "   cpu s  s/photograph  memory GB"
 )
 
@@ -172,25 +174,31 @@ def run_wall(folder: Path, wall: Wall, jobs: int) -> dict[str, float]:
     result = run_survey(read_survey(folder / "survey.toml"), jobs=jobs)
     seconds = time.process_time() - begun
     peak = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1e6
-    a, truth = result.adjustment, wall.faces.place(wall.face, wall.centre)
-    of_code = {str(code): j for j, code in enumerate(wall.code.tolist()) if code >= 0}
-    rows = np.array([j for j, name in enumerate(a.network.points) if name in of_code])
-    true = truth[[of_code[a.network.points[j]] for j in rows]]
-    placed = fit_similarity(a.estimate.points[rows], true)
-    error = placed.apply(a.estimate.points[rows]) - true
-    sigma = placed.scale * np.sqrt(np.diagonal(a.covariance.points[rows], axis1=1, axis2=2))
+    a = result.adjustment
+    on = np.flatnonzero(a.estimate.oriented)
+    of_truth = [int(Path(a.network.images[i]).stem) for i in on]
+    moved = fit_similarity(a.estimate.position[on], wall.position[of_truth])
+    placed = moved.apply_estimate(a.estimate)
+    centres, true_rotation = placed.position[on] - wall.position[of_truth], wall.rotation[of_truth]
+    covariance = covariance_on_centres(a)
+    predicted = moved.scale * rms_of(np.sqrt(np.diagonal(covariance)).reshape(-1, 6)[:, :3])
+    errors = errors_before(moved, centres, true_rotation, placed.rotation[on])
     print(
-        f"{len(wall.position):>11}{int(a.estimate.oriented.sum()):>10}{len(a.network.points):>8}"
-        f"{len(a.network.image_points):>8}{np.sqrt((error**2).sum(axis=1).mean()):>10.4f}"
-        f"{np.sqrt((sigma**2).sum(axis=1).mean()):>14.4f}"
-        f"{np.sqrt((error**2).sum(axis=1).mean() / (sigma**2).sum(axis=1).mean()):>13.2f}"
-        f"{seconds:>8.1f}{seconds / len(wall.position):>14.3f}{peak:>11.2f}",
+        f"{len(wall.position):>11}{len(on):>10}{len(a.network.points):>8}{len(a.network.image_points):>8}"
+        f"{rms_of(centres):>12.4f}{predicted:>14.4f}{rms_of(centres) / predicted:>7.2f}"
+        f"{joint_distance(errors, covariance):>17.2f}{seconds:>8.1f}{seconds / len(wall.position):>14.3f}"
+        f"{peak:>11.2f}",
         flush=True,
     )
     stages = {stage.stage: stage.seconds for stage in result.seconds}
     print("   ", ", ".join(f"{name} {took:.1f} s" for name, took in stages.items()), flush=True)
     print("   ", ", ".join(remark.kind for remark in result.remarks), flush=True)
     return stages | {"together": seconds}
+
+
+def rms_of(vectors: FloatArray) -> float:
+    """Return the root mean square length of vectors, (m, 3)."""
+    return float(np.sqrt((vectors**2).sum(axis=1).mean()))
 
 
 def main() -> None:
