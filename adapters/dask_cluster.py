@@ -127,7 +127,7 @@ def local_engine(workers: int) -> Iterator[DaskEngine]:
                     n_workers=workers,
                     threads_per_worker=1,
                     processes=True,
-                    memory_limit="auto",
+                    memory_limit=distributed.system.MEMORY_LIMIT // workers,
                     host="127.0.0.1",
                     dashboard_address="127.0.0.1:0",  # None opens a server on a fixed port to the world
                     scheduler_kwargs={"dashboard": False},
@@ -392,46 +392,43 @@ class DaskEngine:
             BackendError: the scheduler or all workers are gone, workers died repeatedly, or lack Kolinear.
             KolinearError: an error raised by a called function.
         """
-        futures = self._start(_in_one_thread, calls)
-        done: queue.SimpleQueue[int] = queue.SimpleQueue()
-        for number, future in enumerate(futures):
-            future.add_done_callback(lambda _, number=number: done.put(number))
-        someone, left = time.monotonic(), len(futures)
-        try:
-            while left:
-                # not Dask's `wait`: its TimeoutError keeps what the calls took until Python finds the cycle
-                try:
-                    number = done.get(timeout=LOOK_SECONDS)
-                except queue.Empty:
-                    someone = self._last_seen(someone, ADJUSTMENT_AGAIN)
-                else:
-                    someone, left = time.monotonic(), left - 1
-                    result = futures[number].result()
-                    futures[number].release()  # its worker need not hold it any longer
-                    yield number, result
-                for worker in self._lost_workers():
-                    self.say(f"worker {worker} was lost; the others compute its blocks again")
-        except CancelledError as error:
-            raise BackendError(
-                f"the Dask scheduler is gone or has dropped the work; {ADJUSTMENT_AGAIN}"
-            ) from error
-        except KilledWorker as error:
-            raise BackendError(
-                f"{DIED}, while they computed a block of the network; use more workers, or more memory"
-            ) from error
-        except ImportError as error:
-            raise BackendError(
-                f"the workers of the cluster lack what Kolinear needs: {_line(error)}"
-            ) from error
+        with _in_words():
+            futures = self._start(_in_one_thread, calls)
+            for number in self._as_they_end(futures):
+                result = futures[number].result()
+                futures[number].release()  # its worker need not hold it any longer
+                yield number, result
 
     def fetch(self, calls: Iterable[Call]) -> list[Any]:
-        """Return the results of calls in their order, see `each`.
+        """Return the results of calls in their order, see sfm.runtime.executor.Keeper.
 
         Raises:
             BackendError: see `each`.
             KolinearError: see `each`.
         """
-        return [result for _, result in sorted(self.each(calls), key=lambda ended: ended[0])]
+        with _in_words():
+            futures = self._start(_in_one_thread, calls)
+            for _ in self._as_they_end(futures):
+                pass
+            return list(self.client.gather(futures))
+
+    def _as_they_end(self, futures: list[Future[Any]]) -> Iterator[int]:
+        """Yield the numbers of futures as they end, and say which workers are lost meanwhile."""
+        done: queue.SimpleQueue[int] = queue.SimpleQueue()
+        for number, future in enumerate(futures):
+            future.add_done_callback(lambda _, number=number: done.put(number))
+        someone, left = time.monotonic(), len(futures)
+        while left:
+            # not Dask's `wait`: its TimeoutError keeps what the calls took until Python finds the cycle
+            try:
+                number = done.get(timeout=LOOK_SECONDS)
+            except queue.Empty:
+                someone = self._last_seen(someone, ADJUSTMENT_AGAIN)
+            else:
+                someone, left = time.monotonic(), left - 1
+                yield number
+            for worker in self._lost_workers():
+                self.say(f"worker {worker} was lost; the others do its work again")
 
     def _lost_workers(self) -> Iterator[str]:
         """Yield the workers that were lost since the last look."""
@@ -459,6 +456,21 @@ class DaskEngine:
                 "nothing more can be moved to their disks"
             )
         return someone
+
+
+@contextmanager
+def _in_words() -> Iterator[None]:
+    """Raise the errors of Dask as `BackendError`, in one line."""
+    try:
+        yield
+    except CancelledError as error:
+        raise BackendError(
+            f"the Dask scheduler is gone or has dropped the work; {ADJUSTMENT_AGAIN}"
+        ) from error
+    except KilledWorker as error:
+        raise BackendError(f"{DIED}, at a part of the survey; use more workers, or more memory") from error
+    except ImportError as error:
+        raise BackendError(f"the workers of the cluster lack what Kolinear needs: {_line(error)}") from error
 
 
 def _call(call: Call, parts: list[Any] | None = None, *, topic: str, work: str) -> Any:

@@ -547,7 +547,9 @@ def in_field(
     """
     rays = (points - position) @ rotation
     off_axis = np.arctan2(np.linalg.norm(rays[:, :2], axis=1), -rays[:, 2])
-    return np.asarray(off_axis <= FIELD_MARGIN * camera.field_angle + reach_px / camera.c_px)
+    field = camera.field_angle  # up to a right angle, and lenses that reach it may reach beyond
+    widest = np.pi if field >= np.pi / 2 else FIELD_MARGIN * field + reach_px / camera.c_px
+    return np.asarray(off_axis <= widest)
 
 
 def pixel_jacobian(camera: Camera, xy_px: FloatArray) -> FloatArray:

@@ -111,6 +111,18 @@ def sources_of(*modules: str) -> dict[str, str]:
 
 
 @cache
+def code_version(*modules: str) -> str:
+    """Return a fingerprint of modules: their sources, all that they import, and versions of libraries."""
+    import cv2
+    import numpy
+
+    digest = hashlib.sha256(f"{cv2.__version__} {numpy.__version__}".encode())
+    for _, source in sorted(sources_of(*modules).items()):
+        digest.update(source.encode())
+    return digest.hexdigest()
+
+
+@cache
 def source_hash(module: str) -> str | None:
     """Return the SHA-256 of a module and all that it imports from this package; None for other modules."""
     if _source(module) is None:

@@ -43,6 +43,7 @@ OTHER_GROWTH = (1.0, 0.0, 0.6)
 # rendered photographs (0.8 to 0.9), and of 12,500 to 650,000 given image points.
 PROGRAM_MB = 360.0
 MEMORY_GROWTH = (0.85, 0.4, 1.0)
+SHARE_WITHOUT_REPORT = 0.6  # of memory: 0.64 and 0.54 for rendered blocks of 250 and 1,000 photographs
 # Relative standard deviation of expected memory, and what is added by each factor of e between the sizes of
 # the survey and of the run that it is scaled from: the errors, 1 to 12 % near in size, and 1 to 18 % a factor
 # of e beyond (docs/validation.md, "Time and memory said beforehand").
@@ -197,7 +198,8 @@ def forecast(work: Work, runs: Sequence[Run], *, without: Container[str] = ()) -
     seconds = {stage: took for stage, took in nearest.scaled_to(work).items() if stage not in without}
     if measured is None:
         return Forecast(seconds)
-    return Forecast(seconds, measured.memory_scaled_to(work), measured.work.distance(work))
+    memory_mb = measured.memory_scaled_to(work) * (SHARE_WITHOUT_REPORT if "report" in without else 1.0)
+    return Forecast(seconds, memory_mb, measured.work.distance(work))
 
 
 def duration(seconds: float) -> str:

@@ -10,12 +10,14 @@ import math
 import os
 import sys
 from contextlib import suppress
+from functools import cache
 from pathlib import Path
 
 try:
     import resource
 except ImportError:  # Windows
     resource = None  # type: ignore[assignment]
+MOST_FILES = 30_000  # that may be open, where the system does not limit them: it maps twice as many
 MEMINFO, STATUS = Path("/proc/meminfo"), Path("/proc/self/status")
 GROUPS, OF_PROCESS = Path("/sys/fs/cgroup"), Path("/proc/self/cgroup")
 # Files of a control group, version 2 and version 1: its limit, above which its processes are ended, what it
@@ -34,6 +36,22 @@ def peak_bytes() -> float:
     if resource is None or sys.platform != "darwin":
         return 0.0
     return float(resource.getrusage(resource.RUSAGE_SELF).ru_maxrss)
+
+
+@cache
+def open_files() -> int:
+    """Return how many files this process may have open; the limit is raised to what the system allows."""
+    if resource is None:
+        return MOST_FILES
+    soft, hard = resource.getrlimit(resource.RLIMIT_NOFILE)
+    wanted = MOST_FILES if hard == resource.RLIM_INFINITY else min(hard, MOST_FILES)
+    if soft == resource.RLIM_INFINITY or soft >= wanted:
+        return MOST_FILES if soft == resource.RLIM_INFINITY else soft
+    try:
+        resource.setrlimit(resource.RLIMIT_NOFILE, (wanted, hard))
+    except (ValueError, OSError):
+        return soft
+    return wanted
 
 
 def limit_bytes() -> float:

@@ -86,7 +86,7 @@ def test_two_workers_give_the_bits_of_this_process(
     at_third_factor(monkeypatch, lambda: os.kill(pids[victim], signal.SIGKILL))
     assert bits(adjusted(two_workers, 2)) == here
     said = capfd.readouterr().err.splitlines()
-    assert said == [f"worker {victim} was lost; the others compute its blocks again"]
+    assert said == [f"worker {victim} was lost; the others do its work again"]
 
 
 def test_an_error_in_a_block_is_raised_here(two_workers: DaskEngine) -> None:

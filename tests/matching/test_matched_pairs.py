@@ -7,6 +7,7 @@ import pickle
 import signal
 from collections.abc import Iterable, Iterator
 from dataclasses import fields, replace
+from itertools import chain, repeat
 from pathlib import Path
 from typing import Any
 
@@ -19,7 +20,9 @@ from sfm.matching.tracks.features import Features, PairMatches, TwoMotions, matc
 from sfm.matching.tracks.interest import NaturalPoints
 from sfm.matching.tracks.matched_pairs import MatchedPairs, Matches, MatchTable
 from sfm.model.conventions import IntArray
+from sfm.model.errors import BackendError
 from sfm.runtime.executor import Blocking, Call, KeptHere, in_blocks
+from sfm.survey.measuring import measured_store
 from sfm.survey.measuring.measured_store import TEXTURE, MeasuredStore, StoredMatches, measured_once
 from tests.matching.test_overlap import strip
 from tests.synthetic import seed_of
@@ -139,6 +142,16 @@ def test_other_processes_find_the_same_matches(tmp_path: Path, monkeypatch: pyte
     assert add(MatchedPairs(store=store), views) == whole and nothing.times == 0
 
 
+def test_matches_of_another_version_are_refused(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """They may differ, and would be kept as those of this version."""
+    versions = chain(["here"], repeat("there"))
+    monkeypatch.setattr(matched_pairs, "code_version", lambda _: next(versions))
+    monkeypatch.setattr(matched_pairs, "MIN_PAIRS_ELSEWHERE", 1)
+    with in_blocks(Blocking(InTurn())), pytest.raises(BackendError, match="another version of Kolinear"):
+        add(MatchedPairs(store=StoredMatches(MeasuredStore(tmp_path))), strip(10))
+    assert not list(tmp_path.rglob("*.npz"))
+
+
 def test_workers_of_dask_find_the_same_matches(
     monkeypatch: pytest.MonkeyPatch, capfd: pytest.CaptureFixture[str]
 ) -> None:
@@ -159,7 +172,9 @@ def test_workers_of_dask_find_the_same_matches(
     assert f"worker {victim} was lost" in capfd.readouterr().err
 
 
-def test_descriptors_of_a_stored_photograph_are_read_when_they_are_used(tmp_path: Path) -> None:
+def test_descriptors_of_a_stored_photograph_are_read_when_they_are_used(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     """In memory is what is small; all is as it was, and an entry without its descriptors is none."""
     rng = seed_of("mapped")
     k = 300
@@ -184,6 +199,11 @@ def test_descriptors_of_a_stored_photograph_are_read_when_they_are_used(tmp_path
             np.testing.assert_array_equal(getattr(of_store, field.name), getattr(points, field.name))
         assert type(of_store.descriptor) is np.ndarray and isinstance(of_store.descriptor.base, np.memmap)
         assert pickle.loads(pickle.dumps(of_store)).descriptor.tobytes() == points.descriptor.tobytes()
+    with monkeypatch.context() as patch:  # as many files may be open as are mapped already
+        patch.setattr(measured_store, "open_files", lambda: 0)
+        in_memory, was_stored = anew()
+        assert was_stored and not isinstance(in_memory.descriptor.base, np.memmap)
+        np.testing.assert_array_equal(in_memory.descriptor, points.descriptor)
     (entry,) = (tmp_path / "store").rglob("*.npy")
     whole = entry.read_bytes()
     for damaged in (whole[:-1], whole[:100], b""):

@@ -12,7 +12,7 @@ import pytest
 
 from adapters.dask_cluster import local_engine
 from sfm.matching.tracks import matched_pairs
-from sfm.model.errors import PhotographError
+from sfm.model.errors import BackendError
 from sfm.model.network import Network
 from sfm.runtime.executor import Blocking, Call, KeptHere, in_blocks
 from sfm.runtime.progress import SILENT, StageClock
@@ -66,6 +66,8 @@ def test_the_workers_of_a_cluster_measure_photographs_and_match_pairs(
         patch.setattr(matched_pairs, "matched_features", never)
         assert_same(measured(survey, MeasuredStore(tmp_path / "there")), here)
         assert_same(measured(survey, MeasuredStore(None)), here)
+    with in_blocks(Blocking(Idle())):  # nothing is left for other processes
+        assert_same(measured(survey, MeasuredStore(tmp_path / "there")), here)
     again = MeasuredStore(tmp_path / "there")
     monkeypatch.setattr(tie_points, "natural_points", never)
     monkeypatch.setattr(matched_pairs, "matched_features", never)
@@ -73,16 +75,46 @@ def test_the_workers_of_a_cluster_measure_photographs_and_match_pairs(
     assert again.has_earlier
 
 
-class WithoutFolders(KeptHere):
-    """A keeper with workers that do not see the photographs."""
+class Idle(KeptHere):
+    """A keeper with workers that are asked nothing."""
 
     workers = 2
 
     def each(self, calls: Iterable[Call]) -> Iterator[tuple[int, Any]]:
-        raise PhotographError("p0.png: no such file")
+        assert not list(calls)
+        yield from ()
 
 
-def test_what_the_workers_cannot_read_is_measured_here(survey: Survey) -> None:
+class WithoutFolders(KeptHere):
+    """A keeper with workers that do not see some of the photographs, or that die of them."""
+
+    workers = 2
+
+    def __init__(self, dies: bool) -> None:
+        self.dies = dies
+
+    def each(self, calls: Iterable[Call]) -> Iterator[tuple[int, Any]]:
+        for number, call in enumerate(calls):
+            if number == 3 and self.dies:
+                raise BackendError("worker processes died")
+            *which, path, keeps = call.arguments
+            unseen = Path("elsewhere") / path.name
+            yield number, call.function(*which, unseen if number % 2 else path, keeps)
+
+
+@pytest.mark.parametrize("dies", [False, True])
+def test_what_the_workers_cannot_measure_is_measured_here(
+    survey: Survey, dies: bool, monkeypatch: pytest.MonkeyPatch
+) -> None:
     here = measured(survey, MeasuredStore(None))
-    with in_blocks(Blocking(WithoutFolders())):
+    numbers = []
+    natural_points = tie_points.natural_points
+
+    def counted(*arguments: Any, **options: Any) -> Any:
+        numbers.append(len(numbers))
+        return natural_points(*arguments, **options)
+
+    monkeypatch.setattr(tie_points, "natural_points", counted)
+    with in_blocks(Blocking(WithoutFolders(dies))):
         assert_same(measured(survey, MeasuredStore(None)), here)
+    assert len(numbers) == M  # each once, by the workers or here

@@ -17,6 +17,8 @@ import numpy as np
 
 from sfm.matching.tracks.features import Features, PairMatches, TwoMotions, matched_features
 from sfm.model.conventions import AnyArray, BoolArray, FloatArray, IntArray
+from sfm.model.errors import BackendError
+from sfm.runtime.compiling import code_version
 from sfm.runtime.executor import Call, Keeper, itself, other_processes
 from sfm.runtime.progress import reported
 from sfm.runtime.threads import in_threads
@@ -26,8 +28,9 @@ Matches = dict[tuple[int, int], PairMatches]  # of pairs of photographs, i < j
 BLOCK_PAIRS = 32  # most pairs of a block: about half a second of work
 BLOCKS_A_THREAD = 4  # at least, so that threads end together
 # Features that the processes hold at a time, bytes: their scheduler keeps a copy of what it sends.
-WAVE_BYTES = 256e6
+WAVE_BYTES = 200e6  # and what the last block adds
 MIN_PAIRS_ELSEWHERE = 500  # new pairs from which other processes match them; fewer take some seconds here
+MOST_KEPT = 500  # pairs of a photograph: of a table with more, what this run does not match again is dropped
 OF_PAIR, OF_MOVING, OF_STILL = range(3)
 
 
@@ -192,7 +195,7 @@ class _Kept:
             match = kept.get(self._fingerprint(j))
             if match is not None and _belong(match, self._features[image], self._features[j]):
                 found[image, j] = match
-        if len(found) < len(others):
+        if len(found) < len(others) and len(kept) <= MOST_KEPT:
             self._tables[image] = kept
         return found
 
@@ -222,13 +225,22 @@ def matched_block(seed: int, features: Features, *others: Features) -> list[Pair
     return [matched_features(features, of_other, seed=seed) for of_other in others]
 
 
+def matched_there(seed: int, features: Features, *others: Features) -> tuple[str, list[PairMatches]]:
+    """Return the version of the code of this process, and the matches of a block."""
+    return code_version(__name__), matched_block(seed, features, *others)
+
+
 def _matched_elsewhere(
     features: Sequence[Features], blocks: Sequence[_Block], seed: int, keeper: Keeper
 ) -> Iterator[tuple[_Block, list[PairMatches]]]:
     """Match blocks in the processes of a keeper, wave by wave, and yield them as they come.
 
     The features of a wave go to the processes once.
+
+    Raises:
+        BackendError: they have another version of Kolinear, OpenCV or numpy, whose matches may differ.
     """
+    version = code_version(__name__)
     begin = 0
     while begin < len(blocks):
         kept: dict[int, Any] = {}
@@ -241,8 +253,12 @@ def _matched_elsewhere(
                         features[k].xy, features[k].scale, features[k].angle, features[k].descriptor
                     )
                     kept[k] = keeper.keep([Call(itself, (one,))])[0]
-                    held += one.xy.nbytes + one.descriptor.nbytes
-            calls.append(Call(matched_block, (seed, kept[block.image], *(kept[j] for j in block.others))))
-        for number, matches in keeper.each(calls):
+                    held += sum(a.nbytes for a in (one.xy, one.scale, one.angle, one.descriptor))
+            calls.append(Call(matched_there, (seed, kept[block.image], *(kept[j] for j in block.others))))
+        for number, (theirs, matches) in keeper.each(calls):
+            if theirs != version:
+                raise BackendError(
+                    "the workers have another version of Kolinear, OpenCV or numpy than this computer"
+                )
             yield blocks[begin + number], matches
         begin += len(calls)

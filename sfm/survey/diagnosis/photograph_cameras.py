@@ -171,18 +171,19 @@ def _explained_otherwise(
     """Return whether another cause makes the image points likelier than per-photograph cameras do.
 
     A network of very many photographs is tested in parts: the cause must be likelier in each of those that
-    have a photograph with a camera of its own.
+    have a photograph with a camera of its own. Nothing speaks for it if no such photograph is oriented.
 
     own_network and own_estimate have the per-photograph cameras; kept photographs, (m,), are not left out.
     """
     images, parts = kept & estimate.oriented, [kept & estimate.oriented]
     if images.sum() > MAX_PHOTOGRAPHS:
         seen, theirs = network.image_points, network.camera != own_network.camera
-        used = accepted & images[seen.image] & estimate.determined[seen.point]
+        used = images[seen.image] & estimate.determined[seen.point]
         parts = [part & images for part in parts_of(network, used, PART_PHOTOGRAPHS)]
         parts = [part for part in parts if (part & theirs).any()]
-    return all(
-        _is_explained_otherwise(network, estimate, own_network, own_estimate, accepted, part, false_alarm)
+    level = false_alarm / max(len(parts), 1)
+    return bool(parts) and all(
+        _is_explained_otherwise(network, estimate, own_network, own_estimate, accepted, part, level)
         for part in parts
     )
 

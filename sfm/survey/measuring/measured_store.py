@@ -14,11 +14,9 @@ import zipfile
 from collections.abc import Callable
 from contextlib import suppress
 from dataclasses import dataclass, field, fields
-from functools import cache
 from pathlib import Path
-from typing import Any, Generic, TypeVar
+from typing import Any, Generic, Literal, TypeVar
 
-import cv2
 import numpy as np
 
 from sfm.files.user_cache import make_user_folder, remove_unused, user_folder
@@ -26,7 +24,8 @@ from sfm.files.whole_files import whole_file
 from sfm.matching.tracks.interest import NaturalPoints
 from sfm.matching.tracks.matched_pairs import MatchTable
 from sfm.model.errors import OutputError, PhotographError
-from sfm.runtime.compiling import sources_of
+from sfm.runtime.compiling import code_version
+from sfm.runtime.memory import open_files
 from sfm.targets.detect import Targets
 
 Measured = Targets | NaturalPoints | MatchTable
@@ -74,6 +73,9 @@ class MeasuredStore:
         """Whether measurements of this run were read from the folder."""
         return any(stored for _, stored in self.held.values())
 
+    def begin(self) -> None:
+        """Be told that something is measured, which is not stored."""
+
     def load(self, key: str, kind: Kind[M]) -> M | None:
         """Return the measurements under a key; None if they are missing or incomplete."""
         if self.folder is None:
@@ -89,7 +91,9 @@ class MeasuredStore:
             with np.load(io.BytesIO(data), allow_pickle=False) as stored:
                 arrays = {f.name: stored[f.name] for f in fields(kind.type) if f.name != kind.mapped}
             if kind.mapped:
-                mapped = np.load(path.with_suffix(".npy"), mmap_mode="c", allow_pickle=False)
+                # each mapped file stays open; those beyond what the system allows are read into memory
+                mode: Literal["c"] | None = "c" if len(self.held) < open_files() // 2 else None
+                mapped = np.load(path.with_suffix(".npy"), mmap_mode=mode, allow_pickle=False)
                 arrays[kind.mapped] = mapped.view(np.ndarray)
                 os.utime(path.with_suffix(".npy"))
             for apart in (True, False):
@@ -168,6 +172,7 @@ def measured_once(
         known, stored = store.held[key]
         if isinstance(known, kind.type):
             return known, stored
+    store.begin()
     measured = measure()
     store.save(key, measured)
     if kind.mapped:
@@ -192,7 +197,7 @@ class StoredMatches:
 
     @staticmethod
     def _key(fingerprint: str, seed: int) -> str:
-        parts = (fingerprint, str(seed), _code_version(MATCHES.measuring))
+        parts = (fingerprint, str(seed), code_version(*MATCHES.measuring))
         return hashlib.sha256("\0".join(parts).encode()).hexdigest()
 
 
@@ -207,7 +212,7 @@ def measured_key(path: Path, kind: Kind[M], settings: str) -> str:
     Raises:
         PhotographError: the photograph cannot be read.
     """
-    parts = (content_hash(path), settings, _code_version(kind.measuring))
+    parts = (content_hash(path), settings, code_version(*kind.measuring))
     return hashlib.sha256("\0".join(parts).encode()).hexdigest()
 
 
@@ -225,12 +230,3 @@ def content_hash(path: Path) -> str:
     except OSError as error:
         why = f"no such file in {path.parent}" if not path.exists() else error.strerror
         raise PhotographError(f"{path.name}: {why}") from error
-
-
-@cache
-def _code_version(measuring: tuple[str, ...]) -> str:
-    """Return a fingerprint of the measuring code: its sources and the versions of its libraries."""
-    digest = hashlib.sha256(f"{cv2.__version__} {np.__version__}".encode())
-    for _, source in sorted(sources_of(*measuring).items()):
-        digest.update(source.encode())
-    return digest.hexdigest()

@@ -13,7 +13,7 @@ from pathlib import PurePosixPath
 import numpy as np
 from scipy.spatial import cKDTree
 
-from sfm.model.camera import Camera, border_pixels, in_field, tangents_from_pixel
+from sfm.model.camera import EDGE_PIXELS, Camera, border_pixels, in_field, tangents_from_pixel
 from sfm.model.conventions import FloatArray, IntArray, rotation_from_angles
 from sfm.model.estimate import Estimate
 from sfm.photographs.exif import USUAL_SIGMAS_M, Metadata, local_coordinates
@@ -24,11 +24,11 @@ NONE = -1  # no photograph
 # their errors: errors alone give 1.5 (three axes).
 MIN_SPREAD_SIGMAS = 2.0
 STEP = 2.0  # between the distances at which fields of view are compared, where the object is not known
+BEYOND = 16.0  # of these, over the extent of the projection centres: few stations before a far façade
 DEPTHS = (0.1, 0.5, 0.9)  # of known points in view, quantiles
 MOST_POINTS = 500  # known points, of which the depths are taken
 RAYS = 3  # rows and columns of the rays of a photograph that are compared
 CANDIDATES = 2  # footprints tested for each neighbour, the nearest ones at each distance
-EDGE_PIXELS = 9  # of each edge of a photograph, which limit its field of view
 WIDEST = 10.0  # tangent at which the field of view of a fisheye ends here
 
 
@@ -110,9 +110,9 @@ def neighbours_in_view(exterior: Estimate, camera: IntArray, count: int) -> IntA
     """Return the photographs that show most of the field of view of each, most first, (m, k).
 
     Fields of view are compared at the depths of the known points; without any, at distances between half the
-    usual one of nearest photographs and the extent of all. Of what a photograph from another direction shows,
-    the cosine of the angle between the axes counts. Photographs of which the position alone is given have the
-    nearest ones. NONE where there are no others.
+    usual one of nearest photographs and BEYOND times the extent of all. Of what a photograph from another
+    direction shows, the cosine of the angle between the axes counts. Photographs of which the position alone
+    is given have the nearest ones. NONE where there are no others.
 
     Args:
         exterior: cameras, given exterior orientation of m photographs, NaN where not given, and known points.
@@ -165,6 +165,7 @@ def _depths(exterior: Estimate, camera: IntArray, turned: IntArray) -> FloatArra
         shown = points[in_field(lens, X0[i], R, points)]
         seen.append((X0[i] - shown) @ R[:, 2])
     depths = np.concatenate(seen)
+    depths = depths[depths > 0]  # a fisheye shows points behind it
     if len(depths):
         return np.asarray(np.quantile(depths, DEPTHS), dtype=np.float64)
     if len(turned) < 2:
@@ -174,7 +175,7 @@ def _depths(exterior: Estimate, camera: IntArray, turned: IntArray) -> FloatArra
     if not extent or not (apart > 0).any():
         return depths
     nearest = float(np.median(apart[apart > 0])) / 2
-    steps = int(np.ceil(np.log(extent / nearest) / np.log(STEP)))
+    steps = int(np.ceil(np.log(BEYOND * extent / nearest) / np.log(STEP)))
     return np.asarray(nearest * STEP ** np.arange(steps + 1), dtype=np.float64)
 
 

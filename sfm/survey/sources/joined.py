@@ -21,7 +21,7 @@ from sfm.adjustment.solve import AdjustmentOptions, adjust
 from sfm.judgement.survey_result import LeftOutPoint, PhotographTargets
 from sfm.model.conventions import BoolArray, FloatArray, IntArray
 from sfm.model.distributions import chi2_isf
-from sfm.model.errors import GeometryError
+from sfm.model.errors import BackendError, GeometryError, KolinearError
 from sfm.model.estimate import Estimate
 from sfm.model.network import ImagePoints, Network, ScaleBars, rows_of, without_given
 from sfm.model.reduced_network import reduce_network, select_determined
@@ -91,29 +91,65 @@ def _measure_each(
 
     Other processes measure, if there are any; what they cannot read is left to this one.
     """
-    names, keeper = dict(zip(files.paths, files.names, strict=True)), other_processes()
+    names_and_paths, keeper = list(zip(files.names, files.paths, strict=True)), other_processes()
     if keeper is None:
+        name_of = {path: name for name, path in names_and_paths}
         each_photograph(
             files,
-            lambda path: measure_photograph_once(survey, names[path], path, store),
+            lambda path: measure_photograph_once(survey, name_of[path], path, store),
             jobs=jobs,
             progress=progress,
         )
         return
+    stored = [_is_stored(survey, name, path, store) for name, path in names_and_paths]
     kept = keeper.keep([Call(itself, (survey,))])[0]
+    left = [pair for pair, known in zip(names_and_paths, stored, strict=True) if not known]
+    keeps = store.folder is not None
+    calls = [Call(_measured_photograph, (kept, name, path.absolute(), keeps)) for name, path in left]
+    with suppress(BackendError):  # if all of them are gone, what comes next says so
+        for number, held in keeper.each(calls):
+            store.adopt(held)
+            progress.advance(left[number][0])
 
-    def measured_there(path: Path) -> None:
-        call = Call(_measured_photograph, (kept, names[path], path.absolute()))
-        store.adopt(keeper.fetch([call])[0])
 
-    with suppress(GeometryError):  # too few that they can read
-        each_photograph(files, measured_there, jobs=keeper.workers, progress=progress)
+class _NotStoredError(Exception):
+    """A photograph was not measured before."""
 
 
-def _measured_photograph(survey: Survey, image: str, path: Path) -> dict[str, tuple[Measured, bool]]:
-    """Return what is found in a photograph by its keys in a store, each with whether it was read from it."""
-    store = MeasuredStore.of_user()
-    measure_photograph_once(survey, image, path, store)
+@dataclass(frozen=True)
+class _StoredOnly(MeasuredStore):
+    """A store that measures nothing."""
+
+    def begin(self) -> None:
+        """Raise an error instead of measuring."""
+        raise _NotStoredError
+
+
+def _is_stored(survey: Survey, image: str, path: Path, store: MeasuredStore) -> bool:
+    """Return whether a store has all that is measured in a photograph; it is held then."""
+    try:
+        measure_photograph_once(survey, image, path, _StoredOnly(store.folder, store.held))
+    except (_NotStoredError, KolinearError):
+        return False
+    return True
+
+
+def _measured_photograph(
+    survey: Survey, image: str, path: Path, keeps: bool
+) -> dict[str, tuple[Measured, bool]]:
+    """Return what is found in a photograph by its keys in a store, each with whether it was read from it.
+
+    A photograph that cannot be read here, or measured, gives nothing.
+
+    keeps: whether the user's store on this computer is searched, and keeps what is found.
+    """
+    store = MeasuredStore(None)
+    with suppress(KolinearError):
+        store = MeasuredStore.of_user() if keeps else store
+    try:
+        measure_photograph_once(survey, image, path, store)
+    except KolinearError:
+        return {}
     return store.held
 
 
