@@ -15,6 +15,7 @@ from contextlib import contextmanager, nullcontext
 from pathlib import Path
 from typing import Any
 
+import distributed.system
 import numpy as np
 import pytest
 
@@ -94,6 +95,12 @@ def test_an_error_in_a_block_is_raised_here(two_workers: DaskEngine) -> None:
         two_workers.fetch([Call(divmod, (1, 0))])
     (kept,) = two_workers.keep([Call(divmod, (7, 2))])
     assert two_workers.fetch([Call(sum, (kept,))]) == [4]
+
+
+def test_workers_of_this_computer_share_its_memory() -> None:
+    """Fewer of them have more each."""
+    with local_engine(1) as engine:
+        assert engine.call_bytes == distributed.system.MEMORY_LIMIT
 
 
 def test_blocks_that_cannot_be_are_refused() -> None:

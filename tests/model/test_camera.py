@@ -12,6 +12,7 @@ from sfm.model.camera import (
     Camera,
     camera_from_values,
     corner_shift,
+    in_field,
     parameter_jacobian,
     pixel_from_rays,
     pixel_from_tangents,
@@ -256,6 +257,22 @@ def test_points_behind_the_camera_are_not_seen() -> None:
     xy = project(camera, np.zeros(3), np.eye(3), np.array([[0, 0, -2.0], [0, 0, 2.0]]))
     assert np.isfinite(xy[0]).all()
     assert np.isnan(xy[1]).all()
+
+
+@pytest.mark.parametrize("model", MODELS)
+def test_what_a_photograph_shows_is_in_its_field(model: str) -> None:
+    """Also beyond a right angle from the axis, where a lens shows that."""
+    wide = MODELS[model].stereographic
+    camera = camera_from_values("C", model, (2000, 1500), (0.005, 0.005), c_mm=2.7 if wide else 6.0)
+    rng = seed_of(f"field {model}")
+    away, turn = rng.uniform(0, np.radians(110), 2000), rng.uniform(0, 2 * np.pi, 2000)
+    rays = np.column_stack([np.sin(away) * np.cos(turn), np.sin(away) * np.sin(turn), -np.cos(away)])
+    xy = project(camera, np.zeros(3), np.eye(3), rays)
+    shown = ((xy >= 0) & (xy <= (1999, 1499))).all(axis=1)
+    inside = in_field(camera, np.zeros(3), np.eye(3), rays)
+    assert shown.sum() > 100 and inside[shown].all()
+    assert (wide or not inside.all()) and (model != "opencv_fisheye" or (away[shown] > np.pi / 2).any())
+    assert not in_field(camera, np.zeros(3), np.eye(3), np.full((1, 3), np.nan)).any()
 
 
 @pytest.mark.parametrize("model", MODELS)

@@ -150,6 +150,26 @@ def test_in_a_large_network_parts_decide_what_all_photographs_share(monkeypatch:
     assert asked and max(asked) <= 8
 
 
+def test_nothing_speaks_against_the_camera_of_a_photograph_that_no_part_has(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    """The adjustment of a large network has removed it: no other cause is likelier for it."""
+    network, truth = with_zoom("removed", {7: 0.95})
+    camera = network.camera.copy()
+    camera[7] = 1
+    lost = np.arange(10) == 7
+    position = np.where(lost[:, None], np.nan, truth.position)
+    removed = replace(
+        truth, position=position, rotation=np.where(lost[:, None, None], np.nan, truth.rotation)
+    )
+    own = replace(truth, cameras=(*truth.cameras, truth.cameras[0]))
+    monkeypatch.setattr(photograph_cameras, "MAX_PHOTOGRAPHS", 8)
+    accepted, kept = ~lost[network.image_points.image], np.ones(10, dtype=bool)
+    assert not photograph_cameras._explained_otherwise(
+        network, removed, replace(network, camera=camera), own, accepted, kept, 0.05
+    )
+
+
 def test_the_tolerance_is_that_of_half_a_step_of_c() -> None:
     largest = []
     for name in ("first", "second", "third"):

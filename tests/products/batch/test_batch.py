@@ -191,7 +191,7 @@ def test_failures_are_rows_and_the_others_go_on(surveys: tuple[Path, ...], tmp_p
     assert not [path for path in out.rglob("*.part")]
 
 
-def test_a_survey_that_cannot_fit_is_set_aside_before_it_starts(
+def test_a_survey_that_cannot_fit_does_not_start(
     surveys: tuple[Path, ...], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path / "cache"))
