@@ -319,7 +319,7 @@ def survey_of_file(file: SurveyFile) -> Survey:
         targets=file.targets,
         plates=file.plates,
         tie_points=file.tie_points,
-        pairs=read(read_pairs, None if file.tie_points is None else file.tie_points.pairs),
+        pairs=read(read_pairs, file.texture.pairs),
         datum=file.datum,
         adjust=file.adjust,
         compare=file.compare,
