@@ -154,12 +154,12 @@ def write_survey(folder: Path, wall: Wall) -> None:
         shown = CircularTargets(
             wall.face[near], wall.centre[near], np.full(len(near), RADIUS), wall.code[near]
         )
-        one = slice(i, i + 1)
+        station = slice(i, i + 1)
         (picture,), _ = render_photographs(
             Scene(wall.faces, marks, shown),
             wall.camera,
-            wall.position[one],
-            wall.rotation[one],
+            wall.position[station],
+            wall.rotation[station],
             optics=optics,
             seed=i,
             threads=1,
@@ -217,7 +217,9 @@ def main() -> None:
         times.append(run_wall(folder, wall, arguments.jobs))
     if len(times) > 1:
         for name in times[0]:
-            power = np.polyfit(np.log(arguments.photographs), np.log([one[name] for one in times]), 1)[0]
+            power = np.polyfit(
+                np.log(arguments.photographs), np.log([of_size[name] for of_size in times]), 1
+            )[0]
             print(f"{name} grows as n^{power:.2f}")
 
 

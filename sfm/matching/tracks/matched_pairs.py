@@ -77,7 +77,7 @@ class MatchTable:
     def matches(self) -> dict[str, PairMatches]:
         """Return the matches by the fingerprints of the other photographs."""
         first = np.searchsorted(self.pair, np.arange(len(self.pair_other) + 1))
-        found = {}
+        matches = {}
         for number, other in enumerate(self.pair_other.tolist()):
             part = slice(first[number], first[number + 1])
             rows, distinct, kind = self.rows[part], self.distinct[part], self.kind[part]
@@ -85,8 +85,10 @@ class MatchTable:
             motions = None
             if self.pair_moves[number]:
                 motions = TwoMotions(rows[moving], distinct[moving], rows[still])
-            found[other] = PairMatches(rows[pair], distinct[pair], int(self.pair_candidates[number]), motions)
-        return found
+            matches[other] = PairMatches(
+                rows[pair], distinct[pair], int(self.pair_candidates[number]), motions
+            )
+        return matches
 
 
 class MatchStore(Protocol):
@@ -132,8 +134,8 @@ class MatchedPairs:
             for i, of_first in groupby(sorted(new), key=lambda pair: pair[0]):
                 self.known.update(store.read(i, [j for _, j in of_first]))
             new = [pair for pair in new if pair not in self.known]
-        found = self._matched(features, new, seed, threads, store)
-        for pair, match in reported("pairs of photographs matched", found, len(new)):
+        matched = self._matched(features, new, seed, threads, store)
+        for pair, match in reported("pairs of photographs matched", matched, len(new)):
             self.known[pair] = match
         return {pair: self.known[pair] for pair in every}
 
@@ -190,14 +192,14 @@ class _Kept:
         table = self._store.load(self._fingerprint(image), seed=self._seed)
         if table is None:
             return {}
-        kept, found = table.matches(), Matches()
+        kept, asked = table.matches(), Matches()
         for j in others:
             match = kept.get(self._fingerprint(j))
             if match is not None and _belong(match, self._features[image], self._features[j]):
-                found[image, j] = match
-        if len(found) < len(others) and len(kept) <= MOST_KEPT:
+                asked[image, j] = match
+        if len(asked) < len(others) and len(kept) <= MOST_KEPT:
             self._tables[image] = kept
-        return found
+        return asked
 
     def write(self, image: int, matches: dict[int, PairMatches]) -> None:
         """Keep more pairs of a photograph with others."""
@@ -249,11 +251,11 @@ def _matched_elsewhere(
             block = blocks[begin + len(calls)]
             for k in (block.image, *block.others):
                 if k not in kept:
-                    one = Features(
+                    sent = Features(
                         features[k].xy, features[k].scale, features[k].angle, features[k].descriptor
                     )
-                    kept[k] = keeper.keep([Call(itself, (one,))])[0]
-                    held += sum(a.nbytes for a in (one.xy, one.scale, one.angle, one.descriptor))
+                    kept[k] = keeper.keep([Call(itself, (sent,))])[0]
+                    held += sum(a.nbytes for a in (sent.xy, sent.scale, sent.angle, sent.descriptor))
             calls.append(Call(matched_there, (seed, kept[block.image], *(kept[j] for j in block.others))))
         for number, (theirs, matches) in keeper.each(calls):
             if theirs != version:

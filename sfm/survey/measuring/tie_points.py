@@ -115,7 +115,7 @@ def tie_photographs(
         neighbours_in_sequence(names, metadata, PARTNERS),
         neighbours_in_view(given_exterior(survey, names, cameras), camera, PARTNERS),
     )
-    pairs = None if survey.pairs is None else _listed_pairs(survey.pairs, names)
+    pairs = _listed_pairs(survey.pairs, names)
     matched = MatchedPairs(store=None if store is None else StoredMatches(store))
 
     def tie(min_image_points: int) -> TiePoints:
@@ -176,8 +176,10 @@ def tie_photographs(
     )
 
 
-def _listed_pairs(pairs: PairList, names: Sequence[str]) -> IntArray:
-    """Return the pairs of a list whose photographs were both read, i < j, sorted, (p, 2)."""
+def _listed_pairs(pairs: PairList | None, names: Sequence[str]) -> IntArray | None:
+    """Return the pairs of a list whose photographs were both read, i < j, sorted, (p, 2); None without one."""
+    if pairs is None:
+        return None
     index = {name: i for i, name in enumerate(names)}
     listed = [(index[a], index[b]) for a, b in pairs.names if a in index and b in index]
     return np.unique(np.sort(np.array(listed, dtype=np.int64).reshape(-1, 2), axis=1), axis=0)
