@@ -177,7 +177,7 @@ def tie_photographs(
 
 
 def _listed_pairs(pairs: PairList | None, names: Sequence[str]) -> IntArray | None:
-    """Return the pairs of a list whose photographs were both read, i < j, sorted, (p, 2); None without one."""
+    """Return the pairs of a list whose photographs were read, i < j, sorted, (p, 2); None without a list."""
     if pairs is None:
         return None
     index = {name: i for i, name in enumerate(names)}
