@@ -127,7 +127,7 @@ def local_engine(workers: int) -> Iterator[DaskEngine]:
                     n_workers=workers,
                     threads_per_worker=1,
                     processes=True,
-                    memory_limit=distributed.system.MEMORY_LIMIT // workers,
+                    memory_limit=distributed.system.MEMORY_LIMIT // max(workers, 1),
                     host="127.0.0.1",
                     dashboard_address="127.0.0.1:0",  # None opens a server on a fixed port to the world
                     scheduler_kwargs={"dashboard": False},

@@ -111,12 +111,9 @@ def sources_of(*modules: str) -> dict[str, str]:
 
 
 @cache
-def code_version(*modules: str) -> str:
-    """Return a fingerprint of modules: their sources, all that they import, and versions of libraries."""
-    import cv2
-    import numpy
-
-    digest = hashlib.sha256(f"{cv2.__version__} {numpy.__version__}".encode())
+def code_version(libraries: str, *modules: str) -> str:
+    """Return a fingerprint of the versions of libraries, of modules, and of all that these import."""
+    digest = hashlib.sha256(libraries.encode())
     for _, source in sorted(sources_of(*modules).items()):
         digest.update(source.encode())
     return digest.hexdigest()

@@ -145,7 +145,7 @@ def test_other_processes_find_the_same_matches(tmp_path: Path, monkeypatch: pyte
 def test_matches_of_another_version_are_refused(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """They may differ, and would be kept as those of this version."""
     versions = chain(["here"], repeat("there"))
-    monkeypatch.setattr(matched_pairs, "code_version", lambda _: next(versions))
+    monkeypatch.setattr(matched_pairs, "code_version", lambda *_: next(versions))
     monkeypatch.setattr(matched_pairs, "MIN_PAIRS_ELSEWHERE", 1)
     with in_blocks(Blocking(InTurn())), pytest.raises(BackendError, match="another version of Kolinear"):
         add(MatchedPairs(store=StoredMatches(MeasuredStore(tmp_path))), strip(10))

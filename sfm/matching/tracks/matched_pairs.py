@@ -13,6 +13,7 @@ from dataclasses import dataclass, field
 from itertools import groupby
 from typing import Any, NamedTuple, Protocol
 
+import cv2
 import numpy as np
 
 from sfm.matching.tracks.features import Features, PairMatches, TwoMotions, matched_features
@@ -25,6 +26,7 @@ from sfm.runtime.threads import in_threads
 
 Matches = dict[tuple[int, int], PairMatches]  # of pairs of photographs, i < j
 
+LIBRARIES = f"{cv2.__version__} {np.__version__}"  # that measure
 BLOCK_PAIRS = 32  # most pairs of a block: about half a second of work
 BLOCKS_A_THREAD = 4  # at least, so that threads end together
 # Features that the processes hold at a time, bytes: their scheduler keeps a copy of what it sends.
@@ -229,7 +231,7 @@ def matched_block(seed: int, features: Features, *others: Features) -> list[Pair
 
 def matched_there(seed: int, features: Features, *others: Features) -> tuple[str, list[PairMatches]]:
     """Return the version of the code of this process, and the matches of a block."""
-    return code_version(__name__), matched_block(seed, features, *others)
+    return code_version(LIBRARIES, __name__), matched_block(seed, features, *others)
 
 
 def _matched_elsewhere(
@@ -242,7 +244,7 @@ def _matched_elsewhere(
     Raises:
         BackendError: they have another version of Kolinear, OpenCV or numpy, whose matches may differ.
     """
-    version = code_version(__name__)
+    version = code_version(LIBRARIES, __name__)
     begin = 0
     while begin < len(blocks):
         kept: dict[int, Any] = {}

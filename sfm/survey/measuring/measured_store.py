@@ -22,7 +22,7 @@ import numpy as np
 from sfm.files.user_cache import make_user_folder, remove_unused, user_folder
 from sfm.files.whole_files import whole_file
 from sfm.matching.tracks.interest import NaturalPoints
-from sfm.matching.tracks.matched_pairs import MatchTable
+from sfm.matching.tracks.matched_pairs import LIBRARIES, MatchTable
 from sfm.model.errors import OutputError, PhotographError
 from sfm.runtime.compiling import code_version
 from sfm.runtime.memory import open_files
@@ -197,7 +197,7 @@ class StoredMatches:
 
     @staticmethod
     def _key(fingerprint: str, seed: int) -> str:
-        parts = (fingerprint, str(seed), code_version(*MATCHES.measuring))
+        parts = (fingerprint, str(seed), code_version(LIBRARIES, *MATCHES.measuring))
         return hashlib.sha256("\0".join(parts).encode()).hexdigest()
 
 
@@ -212,7 +212,7 @@ def measured_key(path: Path, kind: Kind[M], settings: str) -> str:
     Raises:
         PhotographError: the photograph cannot be read.
     """
-    parts = (content_hash(path), settings, code_version(*kind.measuring))
+    parts = (content_hash(path), settings, code_version(LIBRARIES, *kind.measuring))
     return hashlib.sha256("\0".join(parts).encode()).hexdigest()
 
 
