@@ -516,6 +516,22 @@ def empty_estimate(network: Network, cameras: tuple[Camera, ...]) -> Estimate:
     return Estimate(cameras, np.full((m, 3), np.nan), np.full((m, 3, 3), np.nan), np.full((n, 3), np.nan))
 
 
+def indices_of(names: Sequence[str], wanted: Sequence[str], what: str = "point") -> IntArray:
+    """Return the index of each of many names, (k,).
+
+    Args:
+        names: all names.
+        wanted: k names to find.
+        what: see `index_of`.
+
+    Raises:
+        UnknownNameError: a name is not among them.
+    """
+    first = {name: k for k, name in reversed(list(enumerate(names)))}
+    rows = [first[name] if name in first else index_of(names, name, what) for name in wanted]
+    return np.array(rows, dtype=np.int64)
+
+
 def index_of(names: Sequence[str], name: object, what: str) -> int:
     """Return the index of a name.
 

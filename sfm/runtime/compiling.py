@@ -122,12 +122,7 @@ def code_version(libraries: str, *modules: str) -> str:
 @cache
 def source_hash(module: str) -> str | None:
     """Return the SHA-256 of a module and all that it imports from this package; None for other modules."""
-    if _source(module) is None:
-        return None
-    digest = hashlib.sha256()
-    for _, source in sorted(sources_of(module).items()):
-        digest.update(source.encode())
-    return digest.hexdigest()
+    return None if _source(module) is None else code_version("", module)
 
 
 @cache

@@ -149,7 +149,7 @@ class KeptHere:
 
     def fetch(self, calls: Iterable[Call]) -> list[Any]:
         """Return the results of calls, see `Keeper.fetch`."""
-        return [result for _, result in sorted(self.each(calls), key=lambda ended: ended[0])]
+        return self.keep(calls)
 
 
 @dataclass

@@ -13,7 +13,6 @@ Photogrammetry and 3D Imaging, secs. 2.2.4 and 6.2.3; Horn (1987) for the start 
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -26,6 +25,7 @@ from sfm.model.conventions import BoolArray, FloatArray, IntArray, rotation_from
 from sfm.model.display import counted
 from sfm.model.distributions import FALSE_ALARM
 from sfm.model.errors import GeometryError
+from sfm.model.network import indices_of
 from sfm.model.similarity import Similarity, fit_similarity, similarity_motions
 from sfm.products.geometry.measured import Function, MeasuredPoints, coordinates_of, join_functions
 
@@ -136,11 +136,6 @@ class Nominal:
     xyz: FloatArray  # object unit, (n, 3)
     covariance: FloatArray | None = None  # of each point, object unit^2; None for exact points, (n, 3, 3)
 
-    def indices(self, names: Sequence[str]) -> IntArray:
-        """Return the indices of names, which it has, (k,)."""
-        row_of = {name: k for k, name in enumerate(self.names)}
-        return np.array([row_of[name] for name in names], dtype=np.int64)
-
 
 @checked_arguments()
 def align_321(points: MeasuredPoints, plane: list[str], line: list[str], origin: str) -> Alignment:
@@ -241,7 +236,7 @@ def align_points(
             f"alignment: {counted(len(common), 'nominal point')} measured, a best fit needs 3"
         )
     rows = points.indices(common)
-    nominal_rows = nominal.indices(common)
+    nominal_rows = indices_of(nominal.names, common)
     target = nominal.xyz[nominal_rows]
     fixed = None if scale else 1.0
     if weights == "network" and points.covariance is None and nominal.covariance is None:

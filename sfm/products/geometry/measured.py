@@ -24,7 +24,7 @@ import numpy as np
 from sfm.model.arguments import checked_arguments
 from sfm.model.conventions import BoolArray, FloatArray, IntArray
 from sfm.model.errors import GeometryError
-from sfm.model.network import index_of
+from sfm.model.network import index_of, indices_of
 from sfm.model.similarity import similarity_motions
 from sfm.model.solution import Solution
 
@@ -95,8 +95,7 @@ class MeasuredPoints:
 
     def indices(self, names: Sequence[str]) -> IntArray:
         """Return the indices of points, (k,); UnknownNameError if no point has one of the names."""
-        row_of = {name: k for k, name in reversed(list(enumerate(self.names)))}
-        return np.array([row_of[n] if n in row_of else self.index(n) for n in names], dtype=np.int64)
+        return indices_of(self.names, names)
 
     def matching(self, patterns: Sequence[str], what: str) -> IntArray:
         """Return the indices of the points that match any of several names or patterns, in their order.

@@ -18,6 +18,7 @@ from scipy.spatial import cKDTree
 from sfm.model.arguments import check_indices, checked_arguments, checked_fields
 from sfm.model.conventions import FloatArray, IntArray
 from sfm.model.errors import GeometryError
+from sfm.model.network import indices_of
 from sfm.products.geometry.alignment import Nominal
 from sfm.products.geometry.measured import MeasuredPoints
 from sfm.products.geometry.shapes.fit import ShapeFit
@@ -93,7 +94,7 @@ def deviations_from_points(
     if not common:
         raise GeometryError(f"tolerance {tolerance.name}: no nominal point was measured")
     rows = points.indices(common)
-    of_nominal = nominal.indices(common)
+    of_nominal = indices_of(nominal.names, common)
     d = points.xyz[rows] - nominal.xyz[of_nominal]
     Q = points.blocks[rows]
     if nominal.covariance is not None:

@@ -175,7 +175,8 @@ def _explained_otherwise(
 
     own_network and own_estimate have the per-photograph cameras; kept photographs, (m,), are not left out.
     """
-    images, parts = kept & estimate.oriented, [kept & estimate.oriented]
+    images = kept & estimate.oriented
+    parts = [images]
     if images.sum() > MAX_PHOTOGRAPHS:
         seen, theirs = network.image_points, network.camera != own_network.camera
         used = images[seen.image] & estimate.determined[seen.point]

@@ -23,7 +23,7 @@ from sfm.model.conventions import BoolArray, FloatArray, IntArray
 from sfm.model.distributions import chi2_isf
 from sfm.model.errors import BackendError, GeometryError, KolinearError
 from sfm.model.estimate import Estimate
-from sfm.model.network import ImagePoints, Network, ScaleBars, rows_of, without_given
+from sfm.model.network import ImagePoints, Network, ScaleBars, indices_of, rows_of, without_given
 from sfm.model.reduced_network import reduce_network, select_determined
 from sfm.model.remarks.remark import Remark, remark
 from sfm.orientation.image_rays import intersect_image_points
@@ -385,7 +385,7 @@ def _joined(
     camera = np.zeros(len(images), dtype=np.int64)
     parts, bars = [], [scale_bars(survey.scale_bars, points)]
     for k, (network, before) in enumerate(zip(networks, named, strict=True)):
-        of_image, of_point = _indices(network.images, images), _indices(network.points, points)
+        of_image, of_point = indices_of(images, network.images), indices_of(points, network.points)
         camera[of_image] = network.camera
         seen = network.image_points
         source = np.full(len(seen), k)
@@ -421,23 +421,21 @@ def _joined_overlays(overlays: Sequence[Sequence[PhotographTargets]]) -> tuple[P
     return tuple(by_name.values())
 
 
-def _indices(names: Sequence[str], of: Sequence[str]) -> IntArray:
-    index = {name: k for k, name in enumerate(of)}
-    return np.array([index[name] for name in names], dtype=np.int64)
-
-
 def _fewest_rays(network: Network, parts: Sequence[Measurements | Correspondences]) -> IntArray:
     """Return how many rays each point needs, by the source that asks for the fewest, (n,)."""
     fewest = np.full(len(network.points), np.iinfo(np.int64).max)
     for part in parts:
-        np.minimum.at(fewest, _indices(part.network.points, network.points), part.min_rays)
+        np.minimum.at(fewest, indices_of(network.points, part.network.points), part.min_rays)
     return fewest
 
 
 def _orientation_of(start: Orientation, measured: Measurements, source: int) -> Orientation:
     """Return the orientation of the photographs and points of a source."""
     whole, part, estimate = measured.network, measured.parts[source], start.estimate
-    images, points = _indices(part.network.images, whole.images), _indices(part.network.points, whole.points)
+    images, points = (
+        indices_of(whole.images, part.network.images),
+        indices_of(whole.points, part.network.points),
+    )
     known = set(part.network.points)
     return replace(
         start,
@@ -485,7 +483,7 @@ def _joined_correspondences(
     ]
     network, repeated = _joined(survey, [matched.network for matched in completed], named, used)
     repeated = repeated.after(measured)
-    images = _indices(network.images, measured.network.images)
+    images = indices_of(measured.network.images, network.images)
     position, rotation = start.estimate.position[images].copy(), start.estimate.rotation[images].copy()
     elsewhere = {name: reason for matched in completed for name, reason in matched.left_out}
     out = np.isin(network.images, list(elsewhere))

@@ -36,7 +36,7 @@ from sfm.model.camera import tangents_from_pixel
 from sfm.model.conventions import AnyArray, FloatArray
 from sfm.model.distributions import Levels, chi2_isf
 from sfm.model.errors import SurveyFileError
-from sfm.model.network import ImagePoints, Network
+from sfm.model.network import ImagePoints, Network, indices_of
 from sfm.model.remarks.remark import remark
 from sfm.orientation.image_rays import intersect_image_points
 from sfm.orientation.incremental.sequence import FINAL_TOLERANCE_PX, Orientation
@@ -114,8 +114,7 @@ def match_marks(
     scene = _scene_of(oriented)
     index = {name: i for i, name in enumerate(whole.images)}
     image = np.array([index[name] for name in part.images], dtype=np.int64)
-    row_of = {name: k for k, name in enumerate(points)}
-    point = np.array([row_of[name] for name in part.points], dtype=np.int64)
+    point = indices_of(points, part.points)
     known = np.full((len(points), 3), np.nan)
     known[point] = start.estimate.points
     seen = part.image_points
