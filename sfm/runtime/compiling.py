@@ -113,16 +113,21 @@ def sources_of(*modules: str) -> dict[str, str]:
 @cache
 def code_version(libraries: str, *modules: str) -> str:
     """Return a fingerprint of the versions of libraries, of modules, and of all that these import."""
-    digest = hashlib.sha256(libraries.encode())
-    for _, source in sorted(sources_of(*modules).items()):
-        digest.update(source.encode())
-    return digest.hexdigest()
+    return _hash_of(*modules, libraries=libraries)
 
 
 @cache
 def source_hash(module: str) -> str | None:
     """Return the SHA-256 of a module and all that it imports from this package; None for other modules."""
-    return None if _source(module) is None else code_version("", module)
+    return None if _source(module) is None else _hash_of(module)
+
+
+def _hash_of(*modules: str, libraries: str = "") -> str:
+    """Return the SHA-256 of modules and all that they import, after the versions of libraries."""
+    digest = hashlib.sha256(libraries.encode())
+    for _, source in sorted(sources_of(*modules).items()):
+        digest.update(source.encode())
+    return digest.hexdigest()
 
 
 @cache
